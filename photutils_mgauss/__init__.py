@@ -1,0 +1,42 @@
+"""
+Point-spread functions as sums of Gaussians, and the astrometry made with them.
+
+The data flow, top to bottom::
+
+    star images -> field -> GaussianMixture -> GriddedMixturePSF
+    PSF images  -> fitting / sampling ^                  |
+                                          photometry, crowded
+                 one QTable per exposure  <--------------+
+                            |
+       matching, alignment -> proper_motion -> report, plotting
+
+Every public name is loaded on first use, so that importing the package costs
+little more than importing photutils.
+"""
+from importlib import import_module
+
+try:
+    from photutils_mgauss._version import version as __version__
+except ImportError:  # a source tree that was never installed
+    __version__ = '0.1.0.dev0'
+
+# Public name -> the module that owns it.
+_OWNERS = {
+    'GaussianMixture': 'mixture',
+    'blend': 'mixture',
+}
+
+__all__ = ['__version__', *_OWNERS]
+
+
+def __getattr__(name):
+    if name not in _OWNERS:
+        msg = f'module {__name__!r} has no attribute {name!r}'
+        raise AttributeError(msg)
+    value = getattr(import_module(f'{__name__}.{_OWNERS[name]}'), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__():
+    return sorted({*globals(), *__all__})

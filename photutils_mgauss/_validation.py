@@ -1,0 +1,88 @@
+"""
+Checks of arguments, each raising an error that names argument, rule and value.
+
+About errors: a wrong type raises `TypeError`, a wrong value `ValueError`, and
+both are raised in the public call, never in a kernel. Trouble that belongs to
+one star or stamp of many is not an error: it becomes NaN and a flag.
+"""
+from numbers import Integral, Real
+
+import numpy as np
+
+
+def as_floats(value, name, *, shape=None, finite=True):
+    """
+    Copy ``value`` into a new contiguous native float64 array.
+
+    ``shape`` is checked where given; None in it stands for any length.
+    """
+    try:
+        array = np.array(value, dtype=np.float64, order='C', copy=True)
+    except (TypeError, ValueError) as error:
+        msg = f'{name} must be an array of numbers, got {value!r:.80}'
+        raise TypeError(msg) from error
+    if shape is not None:
+        fits = array.ndim == len(shape) and all(
+            want in (None, got)
+            for want, got in zip(shape, array.shape, strict=True))
+        if not fits:
+            words = ', '.join('n' if n is None else str(n) for n in shape)
+            msg = f'{name} must have shape ({words}), got {array.shape}'
+            raise ValueError(msg)
+    if finite and not np.isfinite(array).all():
+        bad = array[~np.isfinite(array)][0]
+        msg = f'{name} must be finite, got {bad}'
+        raise ValueError(msg)
+    return array
+
+
+def as_real(value, name, *, above=None, minimum=None, maximum=None):
+    """Return ``value`` as a finite float within the limits given."""
+    if isinstance(value, bool) or not isinstance(value, (Real, np.ndarray)):
+        msg = f'{name} must be a number, got {value!r:.80}'
+        raise TypeError(msg)
+    value = float(value)
+    if not np.isfinite(value):
+        msg = f'{name} must be finite, got {value}'
+        raise ValueError(msg)
+    _check_limits(value, name, above, minimum, maximum)
+    return value
+
+
+def as_integer(value, name, *, minimum=None, maximum=None):
+    """Return ``value`` as an int within the limits given."""
+    if isinstance(value, bool) or not isinstance(value, Integral):
+        msg = f'{name} must be an integer, got {value!r:.80}'
+        raise TypeError(msg)
+    _check_limits(value, name, None, minimum, maximum)
+    return int(value)
+
+
+def _check_limits(value, name, above, minimum, maximum):
+    if above is not None and not value > above:
+        msg = f'{name} must be greater than {above}, got {value}'
+        raise ValueError(msg)
+    if minimum is not None and value < minimum:
+        msg = f'{name} must be at least {minimum}, got {value}'
+        raise ValueError(msg)
+    if maximum is not None and value > maximum:
+        msg = f'{name} must be at most {maximum}, got {value}'
+        raise ValueError(msg)
+
+
+def as_shape(value, name, *, minimum=1):
+    """Return ``value``, an int or a pair of ints, as the tuple (ny, nx)."""
+    pair = (value, value) if np.ndim(value) == 0 else tuple(value)
+    if len(pair) != 2:
+        msg = f'{name} must be one integer or two (ny, nx), got {value!r}'
+        raise ValueError(msg)
+    return tuple(as_integer(n, name, minimum=minimum) for n in pair)
+
+
+def as_choice(value, name, choices):
+    """Return ``value`` if it is one of ``choices``."""
+    if value not in choices:
+        words = ', '.join(repr(choice) for choice in choices)
+        msg = f'{name} must be one of {words}, got {value!r}'
+        raise ValueError(msg)
+    return value

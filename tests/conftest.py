@@ -1,0 +1,27 @@
+"""Fixtures shared by all tests: real data that may be absent, and seeds."""
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+REALDATA = Path(os.environ.get(
+    'MGAUSS_REALDATA',
+    Path(__file__).resolve().parents[2] / 'shared' / 'realdata'))
+
+
+@pytest.fixture
+def realdata():
+    """Return a function from a folder's name to its path, or skip."""
+    def folder(name):
+        path = REALDATA / name
+        if not path.is_dir():
+            pytest.skip(reason=f'real data folder {name} is not here')
+        return path
+    return folder
+
+
+@pytest.fixture
+def rng():
+    """Return a seeded random generator, the same for every test."""
+    return np.random.default_rng(20260101)
