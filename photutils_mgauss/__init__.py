@@ -25,6 +25,12 @@ _OWNERS = {
     'MultiGaussianPSFModel': 'model',
     'GaussianMixture': 'mixture',
     'blend': 'mixture',
+    'Epoch': 'proper_motion',
+    'MotionSolution': 'proper_motion',
+    'ProperMotionFitter': 'proper_motion',
+    'barycentric_observer': '_parallax',
+    'decode_motion_flags': 'proper_motion',
+    'invert_wcs': '_wcs_tools',
 }
 
 __all__ = ['__version__', *_OWNERS]
