@@ -4,9 +4,10 @@ Sphinx configuration, on top of the one all astropy packages share.
 Warnings are errors in the build that checks the documentation, and it must
 pass without a network. So references are of two kinds: our own names, which
 have to resolve, and names of other packages, which resolve where their
-inventories can be read (``MGAUSS_INTERSPHINX=1``) and are plain text otherwise.
+inventories can be read (``MGAUSS_INTERSPHINX=1``) and are plain text
+otherwise.
 """
-import datetime
+import datetime as dt
 import os
 from importlib.metadata import version as installed_version
 
@@ -14,7 +15,7 @@ from sphinx_astropy.conf.v3 import *
 
 project = 'photutils_mgauss'
 author = 'The photutils_mgauss developers'
-_year = datetime.datetime.now(tz=datetime.UTC).year
+_year = dt.datetime.now(tz=dt.UTC).year
 project_copyright = f'{_year}, {author}'
 release = installed_version('photutils_mgauss')
 version = '.'.join(release.split('.')[:2])
@@ -41,12 +42,14 @@ else:
     intersphinx_mapping = {}
 
 # Names of other packages and of the standard library, by their first word.
+_others = (
+    'numpy np scipy astropy photutils gwcs pymc arviz numba matplotlib asdf '
+    'concurrent collections functools pathlib typing')
+_plain = (
+    'bool bytes callable complex dict float frozenset int list object '
+    'property range set slice str tuple type None True False')
 nitpick_ignore_regex = [
-    (r'py:.*', r'(numpy|np|scipy|astropy|photutils|gwcs|pymc|arviz|numba'
-               r'|matplotlib|asdf|concurrent|collections|functools|pathlib'
-               r'|typing)(\..*)?'),
-    (r'py:.*', r'(bool|bytes|callable|complex|dict|float|frozenset|int|list'
-               r'|None|object|property|range|set|slice|str|tuple|type)'),
-    (r'py:exc', r'[A-Z][A-Za-z]*(Error|Warning)'),
-    (r'py:obj', r'([A-Z][A-Za-z]*(Error|Warning)|True|False|None)'),
+    ('py:.*', rf'({"|".join(_others.split())})(\..*)?'),
+    ('py:.*', '|'.join(_plain.split())),
+    ('py:.*', '[A-Z][A-Za-z]*(Error|Warning)'),
 ]
