@@ -1,0 +1,179 @@
+"""
+What the two astropy PSF models share: copies, units, parameters, identity.
+"""
+import copy
+
+import numpy as np
+from astropy.modeling import Fittable2DModel, Parameter
+from astropy.units import Quantity, UnitsError
+
+from photutils_mgauss import _compat
+
+
+class PSFParameter(Parameter):
+    """A Parameter that tells its model when it is freed or fixed."""
+
+    @property
+    def fixed(self):
+        """Whether the parameter is kept fixed during fitting."""
+        return super().fixed
+
+    @fixed.setter
+    def fixed(self, value):
+        Parameter.fixed.fset(self, value)
+        model = getattr(self, '_model', None)
+        if model is not None:
+            model._refresh_identity()
+
+    def bound_copy(self, model):
+        """Return a copy that belongs to ``model``, at a tenth of deepcopy."""
+        new = object.__new__(type(self))
+        new.__dict__.update(self.__dict__)
+        new._model = model
+        if isinstance(new._value, np.ndarray):
+            new._value = new._value.copy()
+        return new
+
+
+class PSFModel(Fittable2DModel):
+    """
+    A PSF with total flux ``flux`` at (``x_0``, ``y_0``), for photutils.
+
+    Subclasses add `evaluate`, `fit_deriv`, ``_state`` (what is not in
+    Parameters, hashable) and ``_half_size`` (of the bounding box).
+    """
+
+    flux = PSFParameter(default=1, description='Total flux of the star.')
+    x_0 = PSFParameter(default=0, description='Position of the star in x.')
+    y_0 = PSFParameter(default=0, description='Position of the star in y.')
+
+    # In standard deviations of the widest Gaussian; 5.5 leaves out 3e-7 of
+    # its flux.
+    bbox_factor = 5.5
+
+    def __str__(self):
+        public = _compat.public_class(self).__name__
+        return super().__str__().replace(type(self).__name__, public)
+
+    def _refresh_identity(self):
+        # Called from Parameters while the model is still being built, too.
+        if '_ready' in self.__dict__:
+            _compat.set_identity(self, self._state)
+
+    def _finish(self):
+        self._ready = True
+        self._refresh_identity()
+
+    @property
+    def bounding_box(self):
+        """The limits ((y_min, y_max), (x_min, x_max)) around the star."""
+        dx, dy = self._half_size()
+        x_0, y_0 = self.x_0, self.y_0
+        return ((y_0 - dy, y_0 + dy), (x_0 - dx, x_0 + dx))
+
+    def copy(self):
+        """
+        Return a copy that shares everything but parameters and constraints.
+
+        Photutils copies its model for every star; use `copy.deepcopy` for a
+        copy whose ``meta`` is deep, too.
+
+        Returns
+        -------
+        model : same class
+        """
+        new = object.__new__(type(self))
+        state = dict(self.__dict__)
+        for name in self.param_names:
+            state[name] = state[name].bound_copy(new)
+        state['_parameters'] = state['_parameters'].copy()
+        state['_mconstraints'] = {key: list(value) for key, value
+                                  in state['_mconstraints'].items()}
+        state['_constraints_cache'] = {}
+        if 'meta' in state:
+            state['meta'] = copy.copy(state['meta'])
+        new.__dict__.update(state)
+        return new
+
+    def __copy__(self):
+        return self.copy()
+
+    def __deepcopy__(self, memo):
+        # What is shared is never changed in place, so it stays shared.
+        new = self.copy()
+        memo[id(self)] = new
+        if 'meta' in new.__dict__:
+            new.__dict__['meta'] = copy.deepcopy(self.meta, memo)
+        return new
+
+    def deepcopy(self):
+        """Return a deep copy of the model."""
+        return copy.deepcopy(self)
+
+    def __reduce__(self):
+        return _new_model, (_compat.public_class(self),), self.__dict__
+
+    def __setstate__(self, state):
+        self.__dict__.update(state)
+        self._refresh_identity()
+
+    @property
+    def input_units(self):
+        """The units of x and y, or None if positions have none."""
+        unit = self.x_0.input_unit
+        if unit is None:
+            return None
+        return {self.inputs[0]: unit, self.inputs[1]: self.y_0.input_unit}
+
+    def _parameter_units_for_data_units(self, inputs_unit, outputs_unit):
+        x_unit, y_unit = (inputs_unit[name] for name in self.inputs)
+        if x_unit != y_unit:
+            msg = f'x and y must have the same unit, got {x_unit} and {y_unit}'
+            raise UnitsError(msg)
+        lengths = dict.fromkeys(self._length_names(), x_unit)
+        return {**lengths, 'flux': outputs_unit[self.outputs[0]]}
+
+    def _length_names(self):
+        """Return the names of the parameters that are lengths."""
+        return ['x_0', 'y_0']
+
+
+def _new_model(cls):
+    return object.__new__(cls)
+
+
+def strip_units(values):
+    """Return lengths without units, all in the unit of the first."""
+    unit = next((v.unit for v in values if isinstance(v, Quantity)), None)
+    if unit is None:
+        return values
+    return [v.to_value(unit) if isinstance(v, Quantity) else v
+            for v in values]
+
+
+def split_flux(flux):
+    """Return the flux as a plain float array and its unit or None."""
+    if isinstance(flux, Quantity):
+        return np.asarray(flux.value, float), flux.unit
+    return np.asarray(flux, float), None
+
+
+def with_unit(values, unit):
+    """Return the values with the unit, or as they are if it is None."""
+    return values if unit is None else Quantity(values, unit, copy=False)
+
+
+def flat_points(*arrays):
+    """
+    Return flat contiguous float64 arrays and the shape they broadcast to.
+
+    Arrays of one element stay one element long: kernels treat them as
+    numbers.
+    """
+    arrays = [np.asarray(a, dtype=float) for a in arrays]
+    shape = np.broadcast_shapes(*(a.shape for a in arrays))
+    x, y, *rest = arrays
+    flat = [np.broadcast_to(a, shape).ravel() for a in (x, y)]
+    flat += [a.ravel() if a.size == 1 else np.broadcast_to(a, shape).ravel()
+             for a in rest]
+    return flat, shape

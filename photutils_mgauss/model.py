@@ -1,0 +1,386 @@
+r"""
+A sum of correlated Gaussians as an astropy model.
+
+The weights of K Gaussians are held as K - 1 stick-breaking fractions
+:math:`f_k`, so that any values make a PSF of unit flux,
+
+.. math::
+
+    \omega_k = f_k \prod_{j<k} (1 - f_j), \qquad f_K = 1 .
+"""
+import numpy as np
+
+from photutils_mgauss import _kernels
+from photutils_mgauss._psf_model import (PSFModel, PSFParameter, flat_points,
+                                         split_flux, strip_units, with_unit)
+from photutils_mgauss._validation import as_integer
+from photutils_mgauss.mixture import GaussianMixture
+
+__all__ = ['MultiGaussianPSFModel']
+
+# Fits may step anywhere; beyond these limits shapes stay at the limit.
+_MIN_STDDEV = 1e-3
+_MAX_RHO = 1 - 1e-9
+
+# Bounds that astropy's fitters respect when shapes are free.
+_STDDEV_BOUNDS = (0.05, None)
+_RHO_BOUNDS = (-0.9999, 0.9999)
+_FRACTION_BOUNDS = (0, 1)
+
+
+class MultiGaussianPSFModel(PSFModel):
+    r"""
+    A PSF that is a sum of K correlated Gaussians.
+
+    .. math::
+
+        M(x, y) = F \sum_k \omega_k\, G(x - x_0, y - y_0 \,|\,
+        \alpha_k, \beta_k, \gamma_k)
+
+    with G of Eq. 3 of Nie et al. Used wherever astropy takes a
+    `~astropy.modeling.Fittable2DModel` or photutils a PSF model.
+
+    The parameters are scalars, in this order: ``flux``, ``x_0``, ``y_0``;
+    ``fraction_1`` to ``fraction_{K-1}`` (stick-breaking fractions of the
+    weights, any value in (0, 1) is valid); ``x_mean_k``, ``y_mean_k``,
+    ``x_stddev_k``, ``y_stddev_k``, ``rho_k`` for k = 1 to K [pix]. All but
+    the first three are fixed by default, see `free_shape`.
+
+    Parameters
+    ----------
+    mixture : GaussianMixture, optional
+        The shape of the PSF. ``None`` makes ``n_components`` concentric round
+        Gaussians to start a fit from.
+    n_components : int, optional
+        The number K of Gaussians where no mixture is given.
+    flux : float or `~astropy.units.Quantity`, optional
+        The total flux.
+    x_0, y_0 : float, optional
+        The position of the star, which is the origin of the mixture's means
+        [pix].
+    pixel_integrated : bool, optional
+        Whether the model integrates the mixture over each unit pixel. Leave
+        it off if the mixture already contains the pixel, as those made from
+        ePSFs, PSFEx models or star images do.
+    **kwargs
+        Values of the shape parameters and the keywords of
+        `~astropy.modeling.Model`: ``name``, ``meta``, ``fixed``, ``bounds``.
+
+    Raises
+    ------
+    TypeError
+        If the mixture is not a `GaussianMixture`, or a keyword is unknown.
+    ValueError
+        If ``n_components`` is less than 1.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import GaussianMixture, MultiGaussianPSFModel
+    >>> mixture = GaussianMixture.from_stddevs(
+    ...     [0.8, 0.2], [[0, 0], [0, 0]], [[1, 1.1], [2, 2.2]], [0.1, 0])
+    >>> model = MultiGaussianPSFModel(mixture, flux=100, x_0=5, y_0=4)
+    >>> model
+    <MultiGaussianPSFModel(flux=100, x_0=5, y_0=4, n_components=2)>
+    >>> model(5, 4)
+    12.356...
+    """
+
+    def __init__(self, mixture=None, *, n_components=3, flux=1, x_0=0, y_0=0,
+                 pixel_integrated=False, **kwargs):
+        if mixture is None:
+            mixture = _default_mixture(n_components)
+        elif not isinstance(mixture, GaussianMixture):
+            msg = f'mixture must be a GaussianMixture, got {mixture!r:.80}'
+            raise TypeError(msg)
+        values = _shape_values(mixture)
+        self.param_names = ('flux', 'x_0', 'y_0', *values)
+        self._n_components = mixture.n_components
+        self._pixel_integrated = bool(pixel_integrated)
+        signed = (mixture.weights < 0).any()
+        for name, value in values.items():
+            parameter = PSFParameter(name, default=value, fixed=True,
+                                     bounds=_shape_bounds(name, signed))
+            parameter.model = self
+            self.__dict__[name] = parameter
+        super().__init__(flux=flux, x_0=x_0, y_0=y_0, **kwargs)
+        self._finish()
+
+    @property
+    def n_components(self):
+        """The number K of Gaussians."""
+        return self._n_components
+
+    @property
+    def pixel_integrated(self):
+        """Whether the mixture is integrated over pixels, not sampled."""
+        return self._pixel_integrated
+
+    @property
+    def _state(self):
+        return self._n_components, self._pixel_integrated
+
+    def __repr__(self):
+        pixel = ', pixel_integrated=True' if self._pixel_integrated else ''
+        return (f'<MultiGaussianPSFModel(flux={self.flux.value:g}, '
+                f'x_0={self.x_0.value:g}, y_0={self.y_0.value:g}, '
+                f'n_components={self._n_components}{pixel})>')
+
+    @property
+    def _shape_parameters(self):
+        return [getattr(self, name).value for name in self.param_names[3:]]
+
+    @property
+    def weights(self):
+        """The fraction of the flux in each Gaussian, (K,)."""
+        return _Shape(self._shape_parameters).weights
+
+    @property
+    def mixture(self):
+        """The shape of the PSF, a `GaussianMixture`."""
+        shape = _Shape(self._shape_parameters)
+        return GaussianMixture.from_stddevs(shape.weights, shape.means,
+                                            shape.stddevs, shape.rho)
+
+    def free_shape(self):
+        """
+        Free all shape parameters but the mean of the first Gaussian.
+
+        That mean stays fixed because a common shift of all means cannot be
+        told from ``x_0`` and ``y_0``: fits of both run away.
+
+        Returns
+        -------
+        MultiGaussianPSFModel
+            The model itself, changed in place.
+
+        Examples
+        --------
+        >>> from photutils_mgauss import MultiGaussianPSFModel
+        >>> model = MultiGaussianPSFModel(n_components=1).free_shape()
+        >>> [name for name, fixed in model.fixed.items() if not fixed]
+        ['flux', 'x_0', 'y_0', 'x_stddev_1', 'y_stddev_1', 'rho_1']
+        """
+        for name in self.param_names[3:]:
+            getattr(self, name).fixed = name in ('x_mean_1', 'y_mean_1')
+        return self
+
+    def convolve(self, kernel):
+        """
+        Return the model convolved with a Gaussian.
+
+        Parameters
+        ----------
+        kernel : (2, 2) array_like or GaussianMixture
+            See `GaussianMixture.convolve`.
+
+        Returns
+        -------
+        MultiGaussianPSFModel
+            With the same flux, position and pixel integration; its shape is
+            fixed.
+
+        Examples
+        --------
+        >>> from photutils_mgauss import MultiGaussianPSFModel
+        >>> model = MultiGaussianPSFModel(n_components=1)
+        >>> model.convolve([[3, 0], [0, 0]]).x_stddev_1.value
+        2.0
+        """
+        return MultiGaussianPSFModel(
+            self.mixture.convolve(kernel), flux=self.flux.quantity
+            if self.flux.unit else self.flux.value, x_0=self.x_0.value,
+            y_0=self.y_0.value, pixel_integrated=self._pixel_integrated)
+
+    def evaluate(self, x, y, flux, x_0, y_0, *shape):
+        """
+        Evaluate the model.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Pixel positions.
+        flux, x_0, y_0 : float or array_like
+            Flux and position of the star; they broadcast with x and y.
+        *shape : float
+            The shape parameters, in the order of ``param_names``.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            The model, in the unit of ``flux``.
+        """
+        shape = _Shape(strip_units([x, *shape])[1:])
+        x, y, x_0, y_0 = strip_units([x, y, x_0, y_0])
+        flux, unit = split_flux(flux)
+        dx = np.subtract(x, x_0, dtype=float)
+        dy = np.subtract(y, y_0, dtype=float)
+        (dx, dy), lattice = flat_points(dx, dy)
+        out = np.empty(dx.size)
+        _kernels.evaluate(dx, dy, shape.rows, self._pixel_integrated, out)
+        return with_unit(flux * out.reshape(lattice), unit)
+
+    def fit_deriv(self, x, y, flux, x_0, y_0, *shape):
+        """
+        Evaluate the derivatives by all parameters.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Pixel positions.
+        flux, x_0, y_0, *shape : float
+            The parameters, in the order of ``param_names``.
+
+        Returns
+        -------
+        list of `~numpy.ndarray`
+            One array of the shape of x for each parameter. Those of fixed
+            parameters, which no fit uses, are zero and not computed.
+        """
+        free = [not getattr(self, name).fixed for name in self.param_names]
+        flux = float(np.squeeze(split_flux(flux)[0]))
+        dx = np.asarray(x, float) - np.squeeze(x_0)
+        dy = np.asarray(y, float) - np.squeeze(y_0)
+        (dx, dy), lattice = flat_points(dx, dy)
+        shape = _Shape(shape)
+        if any(free[3:]):
+            columns = self._all_derivatives(dx, dy, flux, shape, free)
+        else:
+            columns = self._position_derivatives(dx, dy, flux, shape)
+        zero = np.zeros(lattice)
+        columns += [zero] * (len(free) - len(columns))
+        return [column.reshape(lattice) if is_free else zero
+                for column, is_free in zip(columns, free, strict=True)]
+
+    def _position_derivatives(self, dx, dy, flux, shape):
+        out = np.empty((3, dx.size))
+        _kernels.evaluate(dx, dy, shape.rows, self._pixel_integrated, out[0])
+        _kernels.gradient(dx, dy, shape.rows, self._pixel_integrated, out[1:])
+        return [out[0], -flux * out[1], -flux * out[2]]
+
+    def _all_derivatives(self, dx, dy, flux, shape, free):
+        jets = np.empty((self._n_components, 6, dx.size))
+        _kernels.jets(dx, dy, shape.unit_rows, self._pixel_integrated, jets)
+        value, gx, gy = np.tensordot(shape.weights, jets[:, :3], 1)
+        columns = [value, -flux * gx, -flux * gy]
+        columns += list(flux * shape.weight_slopes() @ jets[:, 0])
+        for k in range(self._n_components):
+            first = len(columns)
+            columns += shape.derivatives(k, flux, jets[k]) if any(
+                free[first:first + 5]) else [value] * 5
+        return columns
+
+    def _half_size(self):
+        shape = _Shape(self._shape_parameters)
+        reach = np.abs(shape.means) + self.bbox_factor * shape.stddevs
+        return reach.max(axis=0) + 0.5 * self._pixel_integrated
+
+    def _length_names(self):
+        lengths = ('x_mean', 'y_mean', 'x_stddev', 'y_stddev')
+        return ['x_0', 'y_0', *(name for name in self.param_names
+                                if name.rpartition('_')[0] in lengths)]
+
+
+class _Shape:
+    """The shape parameters of a model as arrays, valid whatever they are."""
+
+    def __init__(self, parameters):
+        values = np.array([float(np.squeeze(p)) for p in parameters])
+        n = (values.size + 1) // 6
+        self.fractions = values[:n - 1]
+        # Left of each break, the length of stick that remains.
+        self.rest = np.append(1, np.cumprod(1 - self.fractions))
+        self.weights = self.rest * np.append(self.fractions, 1)
+        table = values[n - 1:].reshape(n, 5)
+        self.means = table[:, :2]
+        self.raw_stddevs = table[:, 2:4]
+        self.stddevs = np.maximum(np.abs(self.raw_stddevs), _MIN_STDDEV)
+        self.rho = np.clip(table[:, 4], -_MAX_RHO, _MAX_RHO)
+
+    @property
+    def unit_rows(self):
+        """The kernels' rows of Gaussians of unit flux each, (K, 6)."""
+        sx, sy = self.stddevs.T
+        p = 1 / (sx**2 * (1 - self.rho) * (1 + self.rho))
+        q = sy**-2
+        return np.column_stack([np.sqrt(p * q) / (2 * np.pi), self.means, p,
+                                self.rho * sx / sy, q])
+
+    @property
+    def rows(self):
+        """The kernels' rows, (K, 6)."""
+        rows = self.unit_rows
+        rows[:, 0] *= self.weights
+        return rows
+
+    def weight_slopes(self):
+        """Return d weight_j / d fraction_i, (K - 1, K)."""
+        n = self.weights.size
+        slopes = np.zeros((n - 1, n))
+        breaks = np.append(self.fractions, 1)
+        for i in range(n - 1):
+            slopes[i, i] = self.rest[i]
+            left = -self.rest[i]
+            for j in range(i + 1, n):
+                slopes[i, j] = left * breaks[j]
+                left *= 1 - breaks[j]
+        return slopes
+
+    def derivatives(self, k, flux, jet):
+        """
+        Return the columns of the mean, stddevs and rho of Gaussian k.
+
+        The derivatives by the covariance follow from the heat equation.
+        """
+        _, gx, gy, gxx, gxy, gyy = flux * self.weights[k] * jet
+        sx, sy = self.stddevs[k]
+        rho = self.rho[k]
+        sign_x, sign_y = np.sign(self.raw_stddevs[k])
+        return [-gx, -gy, sign_x * (sx * gxx + rho * sy * gxy),
+                sign_y * (sy * gyy + rho * sx * gxy), sx * sy * gxy]
+
+
+def _default_mixture(n_components):
+    """Return concentric Gaussians, each twice as wide as the one before."""
+    n = as_integer(n_components, 'n_components', minimum=1)
+    weights = 0.5 ** np.arange(1, n + 1)
+    weights[-1] *= 2
+    stddevs = np.repeat(2.0 ** np.arange(n), 2).reshape(n, 2)
+    return GaussianMixture.from_stddevs(weights, np.zeros((n, 2)), stddevs,
+                                        np.zeros(n))
+
+
+def _shape_values(mixture):
+    """Return the shape parameters of a mixture by name, in order."""
+    values = {f'fraction_{k}': value
+              for k, value in enumerate(_fractions(mixture.weights), 1)}
+    table = np.column_stack([mixture.means, mixture.stddevs, mixture.rho])
+    names = ('x_mean', 'y_mean', 'x_stddev', 'y_stddev', 'rho')
+    for k, row in enumerate(table, 1):
+        values |= {f'{name}_{k}': value
+                   for name, value in zip(names, row, strict=True)}
+    return values
+
+
+def _fractions(weights):
+    """
+    Return the K - 1 stick-breaking fractions of the weights.
+
+    Where nothing of the stick is left the fraction does not matter, unless
+    negative weights follow: then there are no fractions.
+    """
+    rest = 1 - np.append(0, np.cumsum(weights[:-1]))[:-1]
+    empty = np.abs(rest) < 1e-12
+    if (np.abs(weights[:-1][empty]) > 1e-9).any():
+        msg = ('mixture must not have weights that sum to 1 before the last '
+               f'Gaussian, got {weights.tolist()}; put negative ones first')
+        raise ValueError(msg)
+    return np.where(empty, 0.5, weights[:-1] / np.where(empty, 1, rest))
+
+
+def _shape_bounds(name, signed):
+    kind = name.rpartition('_')[0]
+    if kind == 'fraction':
+        return (None, None) if signed else _FRACTION_BOUNDS
+    if kind.endswith('stddev'):
+        return _STDDEV_BOUNDS
+    return _RHO_BOUNDS if kind == 'rho' else (None, None)
