@@ -9,15 +9,16 @@ otherwise.
 """
 import datetime as dt
 import os
-from importlib.metadata import version as installed_version
 
 from sphinx_astropy.conf.v3 import *
+
+import photutils_mgauss
 
 project = 'photutils_mgauss'
 author = 'The photutils_mgauss developers'
 _year = dt.datetime.now(tz=dt.UTC).year
 project_copyright = f'{_year}, {author}'
-release = installed_version('photutils_mgauss')
+release = photutils_mgauss.__version__
 version = '.'.join(release.split('.')[:2])
 
 extensions.remove('sphinx.ext.todo')
@@ -25,11 +26,11 @@ exclude_patterns = ['_build', '**.ipynb_checkpoints']
 html_title = f'{project} {release}'
 html_static_path = []
 html_theme_options = {}
-html_sidebars = {'**': ['sidebar-nav-bs'], 'index': []}
 modindex_common_prefix = ['photutils_mgauss.']
 
-# Every name of ours must resolve.
+# Every name of ours must resolve, and is looked for in the package first.
 nitpicky = True
+rst_prolog = '.. currentmodule:: photutils_mgauss'
 numpydoc_xref_param_type = False
 automodsumm_inherited_members = False
 
@@ -49,6 +50,8 @@ _plain = (
     'bool bytes callable complex dict float frozenset int list object '
     'property range set slice str tuple type None True False')
 nitpick_ignore_regex = [
+    # The base classes of public ones may be private.
+    ('py:.*', r'photutils_mgauss\._.*'),
     ('py:.*', rf'({"|".join(_others.split())})(\..*)?'),
     ('py:.*', '|'.join(_plain.split())),
     ('py:.*', '[A-Z][A-Za-z]*(Error|Warning)'),
