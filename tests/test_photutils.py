@@ -18,12 +18,19 @@ from astropy.table import QTable, Table
 from numpy.testing import assert_allclose
 from photutils.datasets import make_model_image
 from photutils.detection import DAOStarFinder
-from photutils.psf import (IterativePSFPhotometry, PSFPhotometry,
-                           SourceGrouper, make_psf_model_image)
+from photutils.psf import (
+    IterativePSFPhotometry,
+    PSFPhotometry,
+    SourceGrouper,
+    make_psf_model_image,
+)
 from test_gridded import make_grid, some_mixture
 
-from photutils_mgauss import (GaussianMixture, GriddedMixturePSF,
-                              MultiGaussianPSFModel)
+from photutils_mgauss import (
+    GaussianMixture,
+    GriddedMixturePSF,
+    MultiGaussianPSFModel,
+)
 
 
 def narrow_mixture(k):
