@@ -62,7 +62,7 @@ def _panels(p, s, q):
     """Return how many quadrature panels a pixel needs along y."""
     # At fixed x the Gaussian has the precision q + s^2 p along y. Eight
     # points over two standard deviations leave less than 1e-11 of the peak.
-    return max(1, int(ceil(0.5 * sqrt(q + s * s * p))))
+    return max(1, ceil(0.5 * sqrt(q + s * s * p)))
 
 
 @_jit
@@ -138,7 +138,8 @@ def _hessian(dx, dy, p, s, q, integrated):
         g = _gaussian(dx, dy, p, s, q)
         a = p * (dx - s * dy)
         b = q * dy - s * a
-        return (a * a - p) * g, (a * b + s * p) * g, (b * b - q - s * s * p) * g
+        return ((a * a - p) * g, (a * b + s * p) * g,
+                (b * b - q - s * s * p) * g)
     _, right = _edge(dx + 0.5, dy, p, s, q)
     _, left = _edge(dx - 0.5, dy, p, s, q)
     pt, st, qt = _transposed(p, s, q)
@@ -261,7 +262,7 @@ def _add_integrated_row(peak, dx, dy, p, s, q, out):
 
 @_jit
 def render(rows, x_0, y_0, flux, integrated, out):
-    """Add flux times the mixture centred on pixel (x_0, y_0) to out (ny, nx)."""
+    """Add flux times the mixture, centred on (x_0, y_0), to out (ny, nx)."""
     for k in range(rows.shape[0]):
         a, mx, my, p, s, q = rows[k]
         dx = -x_0 - mx
@@ -300,8 +301,9 @@ def _cell(position, grid):
 @_jit
 def blend_weights(x_0, y_0, x_grid, y_grid, index, weights):
     """
-    Put the four neighbours into index (4,) and their bilinear weights, with
-    the derivatives by x_0 and y_0, into weights (3, 4).
+    Find the four neighbours, for index (4,), and their bilinear weights.
+
+    weights (3, 4) takes the weights and their derivatives by x_0 and y_0.
     """
     i, fx, sx = _cell(x_0, x_grid)
     j, fy, sy = _cell(y_0, y_grid)

@@ -1,6 +1,4 @@
-"""
-What the two astropy PSF models share: copies, units, parameters, identity.
-"""
+"""What both astropy PSF models share: copies, units, class identity."""
 import copy
 
 import numpy as np
