@@ -424,7 +424,7 @@ def render_grid(x, y, flux, left, bottom, nodes, x_grid, y_grid, integrated,
 
 _LOG_2PI = float(np.log(2 * np.pi))
 
-# Rows of `limits`, see `_penalty`.
+# Rows of `limits`, see `penalty`.
 _NARROW, _WIDE, _REACH_X, _REACH_Y, _STIFFNESS = range(5)
 
 # What fit_stamp returns.
@@ -432,7 +432,7 @@ FIT_CONVERGED, FIT_STOPPED = range(2)
 
 
 @_jit
-def _draw_unit(shapes, cx, cy, images):
+def draw_unit(shapes, cx, cy, images):
     """Put Gaussians of unit flux into images (K, ny, nx)."""
     for k in range(shapes.shape[0]):
         mx, my, log_l, t, log_m = shapes[k]
@@ -660,7 +660,7 @@ def _hinge(excess, slopes, stiffness, matrix, gradient):
 
 
 @_jit
-def _penalty(shape, limits, matrix, gradient):
+def penalty(shape, limits, matrix, gradient):
     """
     Return the price of a Gaussian outside its limits.
 
@@ -713,7 +713,7 @@ def _residual(stamp, weight, images, fluxes, out):
 
 
 @_jit
-def _project(stamp, weight, centre, shapes, tie, signed, fluxes, scratch):
+def project(stamp, weight, centre, shapes, tie, signed, fluxes, scratch):
     """
     Put the best fluxes for the shapes into fluxes; return the chi square.
 
@@ -722,7 +722,7 @@ def _project(stamp, weight, centre, shapes, tie, signed, fluxes, scratch):
     """
     images, residual, gram, rhs, work, active = scratch[:6]
     total, tie_weight = tie
-    _draw_unit(shapes, centre[0], centre[1], images)
+    draw_unit(shapes, centre[0], centre[1], images)
     n = fluxes.size
     for k in range(n):
         rhs[k] = _weighted_dot(images[k], stamp, weight) + tie_weight * total
@@ -745,13 +745,13 @@ def _weighted_dot(a, b, weight):
 
 
 @_jit
-def _normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
+def normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
                       gradient):
     """
     Put the normal equations into matrix (6K, 6K) and gradient (6K,).
 
     The unknowns are the K fluxes and five shape numbers for each Gaussian.
-    The images and the residual come from `_project`.
+    The images and the residual come from `project`.
     """
     images, residual = scratch[:2]
     polynomials, moments, half, block = scratch[6:]
@@ -798,13 +798,13 @@ def _place(block, k, other, fluxes, matrix):
 
 
 @_jit
-def _add_penalties(shapes, limits, matrix, gradient):
+def add_penalties(shapes, limits, matrix, gradient):
     """Add the limits to the normal equations; return their price."""
     n = shapes.shape[0]
     price = 0.0
     for k in range(n):
         first = n + 5 * k
-        price += _penalty(shapes[k], limits,
+        price += penalty(shapes[k], limits,
                           matrix[first:first + 5, first:first + 5],
                           gradient[first:first + 5])
     return price
@@ -890,7 +890,7 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
     signed, fixed_means : bool
         Whether fluxes may be negative; whether means stay as they are.
     limits : (5,)
-        See `_penalty`.
+        See `penalty`.
     tolerance, max_steps
         Stop when two steps running lower the cost by less than this fraction,
         or after so many steps.
@@ -904,19 +904,19 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
     matrix, factor = matrices
     gradient, step, trial, trial_fluxes = vectors
     idle_matrix, idle_gradient = factor, step
-    cost = _project(stamp, weight, centre, shapes, tie, signed, fluxes,
+    cost = project(stamp, weight, centre, shapes, tie, signed, fluxes,
                     scratch)
-    _normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
+    normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
                       gradient)
-    cost += _add_penalties(shapes, limits, matrix, gradient)
+    cost += add_penalties(shapes, limits, matrix, gradient)
     damping, growth, small = 1e-2, 2.0, 0
     for n_steps in range(1, max_steps + 1):
         gain = _step(matrix, gradient, fluxes, damping, fixed_means, factor,
                      step)
         _move(shapes, step, trial)
-        trial_cost = _project(stamp, weight, centre, trial, tie, signed,
+        trial_cost = project(stamp, weight, centre, trial, tie, signed,
                               trial_fluxes, scratch)
-        trial_cost += _add_penalties(trial, limits, idle_matrix,
+        trial_cost += add_penalties(trial, limits, idle_matrix,
                                      idle_gradient)
         if not trial_cost < cost:
             damping *= growth
@@ -927,9 +927,9 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
         drop = cost - trial_cost
         shapes[:] = trial
         fluxes[:] = trial_fluxes
-        _normal_equations(weight, centre, shapes, fluxes, tie, scratch,
+        normal_equations(weight, centre, shapes, fluxes, tie, scratch,
                           matrix, gradient)
-        _add_penalties(shapes, limits, matrix, gradient)
+        add_penalties(shapes, limits, matrix, gradient)
         small = small + 1 if drop <= tolerance * cost else 0
         cost = trial_cost
         if small >= 2:
