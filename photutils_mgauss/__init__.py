@@ -22,6 +22,7 @@ except ImportError:  # a source tree that was never installed
 
 # Public name -> the module that owns it.
 _OWNERS = {
+    'GriddedMixturePSF': 'gridded',
     'MultiGaussianPSFModel': 'model',
     'GaussianMixture': 'mixture',
     'blend': 'mixture',
@@ -31,6 +32,9 @@ _OWNERS = {
     'barycentric_observer': '_parallax',
     'decode_motion_flags': 'proper_motion',
     'invert_wcs': '_wcs_tools',
+    'FitStatus': 'fitting',
+    'MixtureFit': 'fitting',
+    'fit_mixture': 'fitting',
 }
 
 __all__ = ['__version__', *_OWNERS]

@@ -67,10 +67,10 @@ class GaussianMixture:
     >>> from photutils_mgauss import GaussianMixture
     >>> psf = GaussianMixture([0.8, 0.2], [[0, 0], [0.1, 0]],
     ...                       [[[1, 0.1], [0.1, 1]], [[4, 0], [0, 5]]])
-    >>> psf.evaluate(0, 0)
-    0.13508...
-    >>> psf.render((15, 15), 7.2, 6.9).sum()
-    0.9998...
+    >>> float(psf.evaluate(0, 0))
+    0.1350741229949339
+    >>> float(psf.render((15, 15), 7.2, 6.9).sum())
+    0.9998186131897795
     """
 
     weights: np.ndarray
@@ -190,7 +190,7 @@ class GaussianMixture:
         >>> psf.evaluate([0, 1], 0)
         array([0.63661977, 0.08615711])
         >>> psf.evaluate([0, 1], 0, pixel_integrated=True)
-        array([0.46606494, 0.1074056 ])
+        array([0.46606494, 0.10739071])
         """
         x, y, shape = _points(x, y)
         out = np.empty(x.size)
@@ -255,8 +255,8 @@ class GaussianMixture:
         --------
         >>> from photutils_mgauss import GaussianMixture
         >>> psf = GaussianMixture([1], [[0, 0]], [[[1, 0], [0, 1]]])
-        >>> psf.render((9, 9), 4, 4, flux=100).sum()
-        99.998...
+        >>> float(psf.render((9, 9), 4, 4, flux=100).sum())
+        99.99940394918846
         """
         out = np.zeros(as_shape(shape, 'shape'))
         _kernels.render(self.rows, as_real(x_0, 'x_0'), as_real(y_0, 'y_0'),
