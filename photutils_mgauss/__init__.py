@@ -26,6 +26,9 @@ _OWNERS = {
     'MultiGaussianPSFModel': 'model',
     'GaussianMixture': 'mixture',
     'blend': 'mixture',
+    'FitStatus': 'fitting',
+    'MixtureFit': 'fitting',
+    'fit_mixture': 'fitting',
 }
 
 __all__ = ['__version__', *_OWNERS]
