@@ -450,9 +450,7 @@ def draw_unit(shapes, cx, cy, images):
 
 @_jit
 def _moments_of_product(a, b, weight, cx, cy, order, out):
-    """
-    Put sum_pixels w a b x^n y^m into out[n, m] for n + m <= order <= 4.
-    """
+    """Put sum_pixels w a b x^n y^m into out[n, m], n + m <= order <= 4."""
     out[:order + 1, :order + 1] = 0.0
     for i in range(a.shape[1]):
         s0, s1, s2, s3, s4 = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -610,10 +608,10 @@ def _solve_subset(gram, rhs, active, x, work):
 @_jit
 def _solve_fluxes(gram, rhs, signed, x, active, work):
     """
-    Solve min |G x - z| given gram = G^T G and rhs = G^T z; x >= 0 unless signed.
+    Solve min |G x - z| given gram = G^T G and rhs = G^T z.
 
-    Lawson and Hanson's active set, started from all unknowns free. work is
-    (n, n + 1).
+    Unless signed, x >= 0: Lawson and Hanson's active set, started from all
+    unknowns free. work is (n, n + 1).
     """
     n = rhs.size
     active[:] = True
@@ -671,7 +669,7 @@ def penalty(shape, limits, matrix, gradient):
     receive its share of the normal equations.
     """
     x, y, log_l, t, log_m = shape
-    length, m = exp(log_l), exp(log_m)
+    m = exp(log_m)
     stiffness = limits[_STIFFNESS]
     slopes = np.zeros(5)
     slopes[2] = 1.0

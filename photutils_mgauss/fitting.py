@@ -40,7 +40,7 @@ _STIFFNESS = 1.0
 
 
 class FitStatus(IntEnum):
-    """How a fit ended; `sentence` says it in words."""
+    """How a fit ended; ``sentence`` says it in words."""
 
     CONVERGED = 0
     STOPPED = 1
