@@ -26,6 +26,19 @@ _OWNERS = {
     'MultiGaussianPSFModel': 'model',
     'GaussianMixture': 'mixture',
     'blend': 'mixture',
+    'CSST_BANDS': 'simulation',
+    'Band': 'simulation',
+    'Exposure': 'simulation',
+    'Instrument': 'simulation',
+    'Scene': 'simulation',
+    'crowded_field': 'simulation',
+    'csst_psf': 'simulation',
+    'paper_exposures': 'simulation',
+    'render_stars': 'simulation',
+    'simulate': 'simulation',
+    'simulate_epochs': 'simulation',
+    'sky_field': 'simulation',
+    'sparse_field': 'simulation',
 }
 
 __all__ = ['__version__', *_OWNERS]
