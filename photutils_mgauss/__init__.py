@@ -39,6 +39,9 @@ _OWNERS = {
     'simulate_epochs': 'simulation',
     'sky_field': 'simulation',
     'sparse_field': 'simulation',
+    'FitStatus': 'fitting',
+    'MixtureFit': 'fitting',
+    'fit_mixture': 'fitting',
 }
 
 __all__ = ['__version__', *_OWNERS]
