@@ -28,6 +28,7 @@ _OWNERS = {
     'blend': 'mixture',
     'CSST_BANDS': 'simulation',
     'Band': 'simulation',
+    'DetectorEffects': 'simulation',
     'Exposure': 'simulation',
     'Instrument': 'simulation',
     'Scene': 'simulation',

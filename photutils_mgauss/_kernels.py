@@ -1111,3 +1111,31 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
         damping = max(damping * max(0.2, 1 - quality ** 3), 1e-15)
         growth = 2.0
     return cost, FIT_STOPPED, max_steps
+
+
+@_jit
+def bleed(columns, full_well):
+    """
+    Spread the charge above the full well along each column (n, ny), in place.
+
+    Half of the excess of a pixel goes each way, into the nearest pixels with
+    room; what reaches an end is lost.
+    """
+    ny = columns.shape[1]
+    excess = np.empty(ny)
+    for column in columns:
+        for j in range(ny):
+            excess[j] = 0.5 * max(0.0, column[j] - full_well)
+            column[j] = min(column[j], full_well)
+        for way in range(2):
+            carried = 0.0
+            for step in range(ny):
+                j = step if way == 0 else ny - 1 - step
+                carried += excess[j]
+                room = full_well - column[j]
+                if carried >= room:
+                    carried -= room
+                    column[j] = full_well
+                else:
+                    column[j] += carried
+                    carried = 0.0

@@ -9,7 +9,6 @@ make of it: bias and dark removed, in electrons, with the sky left in.
 An image is made of bands of rows, each with random numbers of its own, so
 that a seed gives the same pixels with any number of threads.
 """
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -20,6 +19,15 @@ from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import QTable
 
 from photutils_mgauss import _kernels
+from photutils_mgauss._detector_effects import (
+    SATURATED,
+    DetectorEffects,
+    add_cosmic_rays,
+    bleed,
+    pattern,
+    respond,
+)
+from photutils_mgauss._parallel import available_cores
 from photutils_mgauss._simulation_catalogues import (
     PAPER_DENSITY,
     crowded_field,
@@ -36,7 +44,8 @@ from photutils_mgauss._simulation_sky import Exposure, paper_exposures
 from photutils_mgauss._validation import as_floats, as_real, as_shape
 from photutils_mgauss.gridded import GriddedMixturePSF
 
-__all__ = ['CSST_BANDS', 'PAPER_DENSITY', 'Band', 'Exposure', 'Instrument',
+__all__ = ['CSST_BANDS', 'PAPER_DENSITY', 'Band', 'DetectorEffects',
+           'Exposure', 'Instrument',
            'Scene', 'crowded_field', 'csst_psf', 'paper_exposures',
            'render_stars', 'simulate', 'simulate_epochs', 'sky_field',
            'sparse_field']
@@ -50,9 +59,6 @@ _FAINTEST = 1e-3
 
 # Sources farther than this from the image are not part of its truth [pix].
 _MARGIN = 64
-
-# Bits of the flags of a pixel.
-SATURATED = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +74,8 @@ class Scene:
         The standard deviation that a pipeline would state, from the image
         itself [electron].
     flags : (ny, nx) `~numpy.ndarray`
-        What is wrong with a pixel, as bits; 0 is a good one.
+        What is wrong with a pixel, as bits: 1 saturated, 2 cosmic ray, 4
+        hot, 8 dead, 16 bad column.
     truth : `~astropy.table.QTable`
         The sources on the image and close to it: ``id``, ``x``, ``y``
         [pix], ``flux`` [electron], ``mag``, ``inside``, and the other
@@ -128,8 +135,8 @@ class Scene:
                       wcs=self.wcs, meta=meta)
 
 
-def simulate(sources, exposure=None, *, instrument=None, psf=None, rng,
-             executor=None):
+def simulate(sources, exposure=None, *, instrument=None, psf=None,
+             effects=None, rng, executor=None):
     """
     Take an image of stars.
 
@@ -146,6 +153,8 @@ def simulate(sources, exposure=None, *, instrument=None, psf=None, rng,
         The camera; its ``shape`` is the size of the image.
     psf : GriddedMixturePSF, optional
         The PSF; by default the `csst_psf` of the band and detector.
+    effects : DetectorEffects, optional
+        The imperfections of the detector; by default it has none.
     rng : int or `~numpy.random.Generator`
         The seed of the noise.
     executor : `~concurrent.futures.Executor`, optional
@@ -176,19 +185,19 @@ def simulate(sources, exposure=None, *, instrument=None, psf=None, rng,
     if psf is None:
         psf = csst_psf(instrument.shape, exposure.band,
                        rng=exposure.detector)
+    effects = DetectorEffects() if effects is None else effects
+    psf = effects.widen(psf)
     wcs = exposure.wcs(instrument.shape, instrument.pixel_scale)
     truth = _truth(sources, exposure, instrument, wcs)
-    electrons = _electrons(truth, psf, instrument, exposure.band, rng,
-                           executor)
-    image = _read(electrons, instrument, rng, executor)
-    flags = np.where(electrons >= instrument.full_well, SATURATED, 0)
-    return Scene(image, _error(image, instrument), flags.astype(np.uint8),
-                 truth, psf, instrument.sky(exposure.band), exposure,
+    chip = _Chip(instrument, effects, exposure)
+    electrons, flags = _expose(chip, truth, psf, rng, executor)
+    image, error = _read(chip, electrons, rng, executor)
+    return Scene(image, error, flags, truth, psf, chip.sky, exposure,
                  instrument, wcs)
 
 
-def simulate_epochs(sources, exposures, *, instrument=None, psfs=None, rng,
-                    executor=None):
+def simulate_epochs(sources, exposures, *, instrument=None, psfs=None,
+                    effects=None, rng, executor=None):
     """
     Take an image of the same sources at each of several exposures.
 
@@ -198,7 +207,7 @@ def simulate_epochs(sources, exposures, *, instrument=None, psfs=None, rng,
         Sources in the sky, as `sky_field` gives them.
     exposures : sequence of Exposure
         For example those of `paper_exposures`.
-    instrument, executor
+    instrument, effects, executor
         As for `simulate`.
     psfs : sequence of GriddedMixturePSF, optional
         The PSF of each exposure; by default the `csst_psf` of its band and
@@ -233,7 +242,7 @@ def simulate_epochs(sources, exposures, *, instrument=None, psfs=None, rng,
         raise ValueError(msg)
     seeds = np.random.default_rng(rng).spawn(len(exposures))
     return [simulate(sources, exposure, instrument=instrument, psf=psf,
-                     rng=seed, executor=executor)
+                     effects=effects, rng=seed, executor=executor)
             for exposure, psf, seed in zip(exposures, psfs, seeds,
                                            strict=True)]
 
@@ -301,7 +310,7 @@ def _run(function, executor, *columns):
     if executor is not None:
         yield from executor.map(function, *columns)
         return
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+    with ThreadPoolExecutor(available_cores()) as pool:
         yield from pool.map(function, *columns)
 
 
@@ -346,49 +355,81 @@ def _render(psf, width, faintest, band, stars):
     return out
 
 
-def _electrons(truth, psf, instrument, band, rng, executor):
-    """Return the electrons drawn in each pixel, saturation applied."""
-    rows = _row_bands(instrument.shape)
+@dataclass(frozen=True, eq=False)
+class _Chip:
+    """A detector during an exposure."""
+
+    instrument: Instrument
+    effects: DetectorEffects
+    exposure: Exposure
+
+    @property
+    def bands(self):
+        """The bands of rows it is made in."""
+        return _row_bands(self.instrument.shape)
+
+    @property
+    def sky(self):
+        """The light of the sky in a pixel [electron]."""
+        return self.instrument.sky(self.exposure.band)
+
+    def pattern(self, band):
+        """Return what is fixed about a band of rows."""
+        return pattern(self.effects, self.exposure.detector, band,
+                       self.instrument.shape[1])
+
+
+def _expose(chip, truth, psf, rng, executor):
+    """Return the electrons in each pixel, at most a full well, and flags."""
     x, y, flux = (truth[name].value for name in ('x', 'y', 'flux'))
-    expose = partial(_expose, psf, instrument, instrument.sky(band))
-    parts = _run(expose, executor, rows,
-                 _split(psf, x, y, flux, rows, _FAINTEST),
-                 rng.spawn(len(rows)))
-    electrons = np.empty(instrument.shape, np.float32)
-    for part, values in zip(rows, parts, strict=True):
-        electrons[part] = values
-    return electrons
+    electrons = np.empty(chip.instrument.shape, np.float32)
+    flags = np.empty(chip.instrument.shape, np.uint8)
+    parts = _run(partial(_expose_band, chip, psf), executor, chip.bands,
+                 _split(psf, x, y, flux, chip.bands, _FAINTEST),
+                 rng.spawn(len(chip.bands)))
+    for band, part in zip(chip.bands, parts, strict=True):
+        electrons[band], flags[band] = part
+    add_cosmic_rays(electrons, flags, chip.effects,
+                    chip.instrument.exposure_time, rng)
+    full_well = chip.instrument.full_well
+    if chip.effects.bleeding:
+        bleed(electrons, full_well)
+    flags |= np.where(electrons >= full_well, SATURATED, 0).astype(np.uint8)
+    np.minimum(electrons, np.float32(full_well), out=electrons)
+    return electrons, flags
 
 
-def _expose(psf, instrument, sky, band, stars, rng):
-    """Return the electrons in a band of rows."""
+def _expose_band(chip, psf, band, stars, rng):
+    """Return the electrons and flags of a band of rows."""
+    instrument, fixed = chip.instrument, chip.pattern(band)
     expected = _render(psf, instrument.shape[1], _FAINTEST, band, stars)
-    expected += sky + instrument.dark_level
-    electrons = rng.poisson(expected).astype(np.float32)
-    return np.minimum(electrons, np.float32(instrument.full_well))
+    expected += chip.sky
+    expected *= fixed.response
+    expected += instrument.dark_level
+    expected += fixed.dark * instrument.exposure_time
+    return rng.poisson(expected).astype(np.float32), fixed.flags
 
 
-def _read(electrons, instrument, rng, executor):
-    """Return the image that a pipeline makes of the electrons."""
-    rows = _row_bands(instrument.shape)
-    parts = _run(partial(_read_rows, instrument), executor,
-                 (electrons[part] for part in rows), rng.spawn(len(rows)))
-    image = np.empty(instrument.shape, np.float32)
-    for part, values in zip(rows, parts, strict=True):
-        image[part] = values
-    return image
+def _read(chip, electrons, rng, executor):
+    """Return the image that a pipeline makes of the electrons, and error."""
+    image = np.empty(electrons.shape, np.float32)
+    error = np.empty(electrons.shape, np.float32)
+    parts = _run(partial(_read_band, chip), executor, chip.bands,
+                 (electrons[band] for band in chip.bands),
+                 rng.spawn(len(chip.bands)))
+    for band, part in zip(chip.bands, parts, strict=True):
+        image[band], error[band] = part
+    return image, error
 
 
-def _read_rows(instrument, electrons, rng):
-    noise = instrument.read_noise * rng.standard_normal(electrons.shape)
-    counts = np.rint((electrons + noise + instrument.bias) / instrument.gain)
-    return counts * instrument.gain - instrument.bias - instrument.dark_level
-
-
-def _error(image, instrument):
-    """Return the standard deviation that the image itself suggests."""
-    level = np.maximum(image + np.float32(instrument.dark_level), 0)
-    return np.sqrt(level + np.float32(instrument.readout_variance))
+def _read_band(chip, band, electrons, rng):
+    instrument, flat = chip.instrument, chip.pattern(band).flat
+    charge = respond(electrons, chip.effects, instrument.full_well)
+    noise = instrument.read_noise * rng.standard_normal(charge.shape)
+    counts = np.rint((charge + noise + instrument.bias) / instrument.gain)
+    level = counts * instrument.gain - instrument.bias
+    variance = np.maximum(level, 0) + instrument.readout_variance
+    return (level - instrument.dark_level) / flat, np.sqrt(variance) / flat
 
 
 def _truth(sources, exposure, instrument, wcs):
