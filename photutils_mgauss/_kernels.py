@@ -20,7 +20,7 @@ factors of its exponent when :math:`x` is conditioned on :math:`y`,
 This form loses no digits to cancellation when the Gaussian is thin and
 tilted, and it is what a walk along a pixel row needs.
 """
-from math import ceil, erf, exp, sqrt
+from math import ceil, erf, exp, factorial, floor, log, sqrt
 
 import numpy as np
 from numba import njit
@@ -406,6 +406,179 @@ def render_grid(x, y, flux, left, bottom, nodes, x_grid, y_grid, integrated,
                        w, integrated, out[i])
 
 
+# Many stars on one image. A Gaussian is drawn where it exceeds ``faintest``,
+# which the caller chooses so low that nobody sees the edge, and anyway down
+# to this fraction of its peak. Nothing is fitted with these functions, so
+# the step at the edge does no harm.
+_DEPTH = 1e-3
+
+
+def _quadrature_tables(tolerance=1e-6, most=8):
+    """
+    Return nodes and weights (most + 1, most) and the precisions they serve.
+
+    The error of n points on a unit interval is bounded by
+    (n!)^4 (2n - 1)!! P^n / ((2n + 1) (2n)!^3) for a Gaussian of unit peak and
+    precision P; row n of the tables serves P up to ``limits[n]``.
+    """
+    nodes = np.zeros((most + 1, most))
+    weights = np.zeros((most + 1, most))
+    limits = np.zeros(most + 1)
+    for n in range(1, most + 1):
+        places, shares = np.polynomial.legendre.leggauss(n)
+        nodes[n, :n], weights[n, :n] = places / 2, shares / 2
+        twice = float(factorial(2 * n))
+        odd = twice / (2**n * factorial(n))
+        bound = factorial(n)**4 * odd / ((2 * n + 1) * twice**3)
+        limits[n] = (tolerance / bound) ** (1 / n)
+    return nodes, weights, limits
+
+
+_POINTS, _SHARES, _LIMITS = _quadrature_tables()
+
+
+@_jit
+def _quadrature_order(precision):
+    """Return the number of points that suffice, or 0 if none does."""
+    for n in range(1, _LIMITS.size):
+        if precision <= _LIMITS[n]:
+            return n
+    return 0
+
+
+@_jit
+def _walk(peak, right, left, fall, start, first, last, row):
+    """
+    Add a row Gaussian to row[first:last + 1], from its value at start.
+
+    right and left are the first quotients of neighbours, fall their change.
+    """
+    row[start] += peak
+    g = peak
+    for i in range(start + 1, last + 1):
+        g *= right
+        right *= fall
+        row[i] += g
+    g = peak
+    for i in range(start - 1, first - 1, -1):
+        g *= left
+        left *= fall
+        row[i] += g
+
+
+@_jit
+def _add_sampled(peak, cx, cy, p, s, q, reach, out):
+    """Add a Gaussian, sampled at pixel centres, to out (ny, nx)."""
+    half = sqrt(reach / q)
+    fall = exp(-p)
+    low, high = max(0, ceil(cy - half)), min(out.shape[0] - 1, cy + half)
+    for j in range(low, floor(high) + 1):
+        dy = j - cy
+        centre = cx + s * dy
+        width = sqrt(max(0.0, reach - q * dy * dy) / p)
+        first = max(0, ceil(centre - width))
+        last = min(out.shape[1] - 1, floor(centre + width))
+        if first > last:
+            continue
+        start = min(max(int(np.rint(centre)), first), last)
+        u = start - centre
+        _walk(peak * exp(-0.5 * (p * u * u + q * dy * dy)),
+              exp(-p * (u + 0.5)), exp(-p * (0.5 - u)), fall, start, first,
+              last, out[j])
+
+
+@_jit
+def _prepare_points(n, p, scratch):
+    """
+    Put what the points along x share into scratch (3, n).
+
+    A point at the fraction t of a pixel has the value of the pixel's centre
+    at u times exp(-p u t) and the first row; the quotients to its neighbours
+    are those of u times the second and third.
+    """
+    for a in range(n):
+        t = _POINTS[n, a]
+        scratch[0, a] = _SHARES[n, a] * exp(-0.5 * p * t * t)
+        scratch[1, a] = exp(-p * (0.5 + t))
+        scratch[2, a] = exp(-p * (0.5 - t))
+
+
+@_jit
+def _add_integrated(peak, cx, cy, p, s, q, reach, scratch, out):
+    """Add a Gaussian, integrated over each pixel, to out (ny, nx)."""
+    n_x = _quadrature_order(p)
+    n_y = _quadrature_order(q + s * s * p)
+    if n_x * n_y == 0:
+        _add_thin(peak, cx, cy, p, s, q, reach, out)
+        return
+    _prepare_points(n_x, p, scratch)
+    half = sqrt(reach / q) + 0.5
+    fall = exp(-p)
+    low, high = max(0, ceil(cy - half)), min(out.shape[0] - 1, cy + half)
+    for j in range(low, floor(high) + 1):
+        for b in range(n_y):
+            dy = j - cy + _POINTS[n_y, b]
+            centre = cx + s * dy
+            width = sqrt(max(0.0, reach - q * dy * dy) / p) + 0.5
+            first = max(0, ceil(centre - width))
+            last = min(out.shape[1] - 1, floor(centre + width))
+            if first > last:
+                continue
+            start = min(max(int(np.rint(centre)), first), last)
+            u = start - centre
+            ridge = (peak * _SHARES[n_y, b]
+                     * exp(-0.5 * (p * u * u + q * dy * dy)))
+            slope = exp(-p * u)
+            for a in range(n_x):
+                _walk(ridge * exp(-p * u * _POINTS[n_x, a]) * scratch[0, a],
+                      slope * scratch[1, a], scratch[2, a] / slope, fall,
+                      start, first, last, out[j])
+
+
+@_jit
+def _add_thin(peak, cx, cy, p, s, q, reach, out):
+    """Add a Gaussian much thinner than a pixel, integrated over each."""
+    half_y = sqrt(reach / q) + 0.5
+    half_x = sqrt(reach * (1 / p + s * s / q)) + 0.5
+    first = max(0, ceil(cx - half_x))
+    last = min(out.shape[1] - 1, floor(cx + half_x))
+    low, high = max(0, ceil(cy - half_y)), min(out.shape[0] - 1, cy + half_y)
+    if first > last:
+        return
+    for j in range(low, floor(high) + 1):
+        _add_integrated_row(peak, first - cx, j - cy, p, s, q,
+                            out[j, first:last + 1])
+
+
+@_jit
+def render_image(x, y, flux, nodes, x_grid, y_grid, integrated, faintest,
+                 bottom, out):
+    """
+    Add stars (n,) in the order given to out, detector rows bottom and up.
+
+    The order of the stars alone decides about rounding: a band of rows has
+    the pixels it would have in the whole image.
+    """
+    index = np.empty(4, np.int64)
+    weights = np.empty((3, 4))
+    scratch = np.empty((3, _LIMITS.size))
+    for i in range(x.size):
+        blend_weights(x[i], y[i], x_grid, y_grid, index, weights)
+        for corner in range(4):
+            share = weights[0, corner] * flux[i]
+            if share == 0:
+                continue
+            for k in range(nodes.shape[1]):
+                a, mx, my, p, s, q = nodes[index[corner], k]
+                if a == 0:
+                    continue
+                cx, cy = x[i] + mx, y[i] + my - bottom
+                reach = 2 * log(max(abs(share * a) / faintest, 1 / _DEPTH))
+                if integrated:
+                    _add_integrated(share * a, cx, cy, p, s, q, reach,
+                                    scratch, out)
+                else:
+                    _add_sampled(share * a, cx, cy, p, s, q, reach, out)
 # Least-squares fits of a mixture to a stamp. Everything is in stamp pixels
 # about a centre near the middle of the stamp. A Gaussian of flux f is a row of
 # five shape numbers, x, y, log l, t, log m, the mean and the Cholesky factor
@@ -936,3 +1109,31 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
         damping = max(damping * max(0.2, 1 - quality ** 3), 1e-15)
         growth = 2.0
     return cost, FIT_STOPPED, max_steps
+
+
+@_jit
+def bleed(columns, full_well):
+    """
+    Spread the charge above the full well along each column (n, ny), in place.
+
+    Half of the excess of a pixel goes each way, into the nearest pixels with
+    room; what reaches an end is lost.
+    """
+    ny = columns.shape[1]
+    excess = np.empty(ny)
+    for column in columns:
+        for j in range(ny):
+            excess[j] = 0.5 * max(0.0, column[j] - full_well)
+            column[j] = min(column[j], full_well)
+        for way in range(2):
+            carried = 0.0
+            for step in range(ny):
+                j = step if way == 0 else ny - 1 - step
+                carried += excess[j]
+                room = full_well - column[j]
+                if carried >= room:
+                    carried -= room
+                    column[j] = full_well
+                else:
+                    column[j] += carried
+                    carried = 0.0
