@@ -26,8 +26,11 @@ _OWNERS = {
     'MultiGaussianPSFModel': 'model',
     'GaussianMixture': 'mixture',
     'blend': 'mixture',
+    'adaptive_moments': 'shapes',
     'FitStatus': 'fitting',
     'MixtureFit': 'fitting',
+    'Shapes': 'shapes',
+    'ShapeStatus': 'shapes',
     'fit_mixture': 'fitting',
 }
 
