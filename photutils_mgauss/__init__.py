@@ -46,8 +46,11 @@ _OWNERS = {
     'barycentric_observer': '_parallax',
     'decode_motion_flags': 'proper_motion',
     'invert_wcs': '_wcs_tools',
+    'adaptive_moments': 'shapes',
     'FitStatus': 'fitting',
     'MixtureFit': 'fitting',
+    'Shapes': 'shapes',
+    'ShapeStatus': 'shapes',
     'fit_mixture': 'fitting',
 }
 
