@@ -26,6 +26,8 @@ _OWNERS = {
     'MultiGaussianPSFModel': 'model',
     'GaussianMixture': 'mixture',
     'blend': 'mixture',
+    'MixtureFitter': 'fitter',
+    'MixturePSFPhotometry': 'photometry',
 }
 
 __all__ = ['__version__', *_OWNERS]
