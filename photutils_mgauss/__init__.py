@@ -52,6 +52,8 @@ _OWNERS = {
     'Shapes': 'shapes',
     'ShapeStatus': 'shapes',
     'fit_mixture': 'fitting',
+    'MixtureFitter': 'fitter',
+    'MixturePSFPhotometry': 'photometry',
 }
 
 __all__ = ['__version__', *_OWNERS]
