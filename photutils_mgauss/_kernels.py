@@ -20,7 +20,7 @@ factors of its exponent when :math:`x` is conditioned on :math:`y`,
 This form loses no digits to cancellation when the Gaussian is thin and
 tilted, and it is what a walk along a pixel row needs.
 """
-from math import ceil, erf, exp, sqrt
+from math import ceil, erf, exp, factorial, floor, log, sqrt
 
 import numpy as np
 from numba import njit
@@ -406,6 +406,179 @@ def render_grid(x, y, flux, left, bottom, nodes, x_grid, y_grid, integrated,
                        w, integrated, out[i])
 
 
+# Many stars on one image. A Gaussian is drawn where it exceeds ``faintest``,
+# which the caller chooses so low that nobody sees the edge, and anyway down
+# to this fraction of its peak. Nothing is fitted with these functions, so
+# the step at the edge does no harm.
+_DEPTH = 1e-3
+
+
+def _quadrature_tables(tolerance=1e-6, most=8):
+    """
+    Return nodes and weights (most + 1, most) and the precisions they serve.
+
+    The error of n points on a unit interval is bounded by
+    (n!)^4 (2n - 1)!! P^n / ((2n + 1) (2n)!^3) for a Gaussian of unit peak and
+    precision P; row n of the tables serves P up to ``limits[n]``.
+    """
+    nodes = np.zeros((most + 1, most))
+    weights = np.zeros((most + 1, most))
+    limits = np.zeros(most + 1)
+    for n in range(1, most + 1):
+        places, shares = np.polynomial.legendre.leggauss(n)
+        nodes[n, :n], weights[n, :n] = places / 2, shares / 2
+        twice = float(factorial(2 * n))
+        odd = twice / (2**n * factorial(n))
+        bound = factorial(n)**4 * odd / ((2 * n + 1) * twice**3)
+        limits[n] = (tolerance / bound) ** (1 / n)
+    return nodes, weights, limits
+
+
+_POINTS, _SHARES, _LIMITS = _quadrature_tables()
+
+
+@_jit
+def _quadrature_order(precision):
+    """Return the number of points that suffice, or 0 if none does."""
+    for n in range(1, _LIMITS.size):
+        if precision <= _LIMITS[n]:
+            return n
+    return 0
+
+
+@_jit
+def _walk(peak, right, left, fall, start, first, last, row):
+    """
+    Add a row Gaussian to row[first:last + 1], from its value at start.
+
+    right and left are the first quotients of neighbours, fall their change.
+    """
+    row[start] += peak
+    g = peak
+    for i in range(start + 1, last + 1):
+        g *= right
+        right *= fall
+        row[i] += g
+    g = peak
+    for i in range(start - 1, first - 1, -1):
+        g *= left
+        left *= fall
+        row[i] += g
+
+
+@_jit
+def _add_sampled(peak, cx, cy, p, s, q, reach, out):
+    """Add a Gaussian, sampled at pixel centres, to out (ny, nx)."""
+    half = sqrt(reach / q)
+    fall = exp(-p)
+    low, high = max(0, ceil(cy - half)), min(out.shape[0] - 1, cy + half)
+    for j in range(low, floor(high) + 1):
+        dy = j - cy
+        centre = cx + s * dy
+        width = sqrt(max(0.0, reach - q * dy * dy) / p)
+        first = max(0, ceil(centre - width))
+        last = min(out.shape[1] - 1, floor(centre + width))
+        if first > last:
+            continue
+        start = min(max(int(np.rint(centre)), first), last)
+        u = start - centre
+        _walk(peak * exp(-0.5 * (p * u * u + q * dy * dy)),
+              exp(-p * (u + 0.5)), exp(-p * (0.5 - u)), fall, start, first,
+              last, out[j])
+
+
+@_jit
+def _prepare_points(n, p, scratch):
+    """
+    Put what the points along x share into scratch (3, n).
+
+    A point at the fraction t of a pixel has the value of the pixel's centre
+    at u times exp(-p u t) and the first row; the quotients to its neighbours
+    are those of u times the second and third.
+    """
+    for a in range(n):
+        t = _POINTS[n, a]
+        scratch[0, a] = _SHARES[n, a] * exp(-0.5 * p * t * t)
+        scratch[1, a] = exp(-p * (0.5 + t))
+        scratch[2, a] = exp(-p * (0.5 - t))
+
+
+@_jit
+def _add_integrated(peak, cx, cy, p, s, q, reach, scratch, out):
+    """Add a Gaussian, integrated over each pixel, to out (ny, nx)."""
+    n_x = _quadrature_order(p)
+    n_y = _quadrature_order(q + s * s * p)
+    if n_x * n_y == 0:
+        _add_thin(peak, cx, cy, p, s, q, reach, out)
+        return
+    _prepare_points(n_x, p, scratch)
+    half = sqrt(reach / q) + 0.5
+    fall = exp(-p)
+    low, high = max(0, ceil(cy - half)), min(out.shape[0] - 1, cy + half)
+    for j in range(low, floor(high) + 1):
+        for b in range(n_y):
+            dy = j - cy + _POINTS[n_y, b]
+            centre = cx + s * dy
+            width = sqrt(max(0.0, reach - q * dy * dy) / p) + 0.5
+            first = max(0, ceil(centre - width))
+            last = min(out.shape[1] - 1, floor(centre + width))
+            if first > last:
+                continue
+            start = min(max(int(np.rint(centre)), first), last)
+            u = start - centre
+            ridge = (peak * _SHARES[n_y, b]
+                     * exp(-0.5 * (p * u * u + q * dy * dy)))
+            slope = exp(-p * u)
+            for a in range(n_x):
+                _walk(ridge * exp(-p * u * _POINTS[n_x, a]) * scratch[0, a],
+                      slope * scratch[1, a], scratch[2, a] / slope, fall,
+                      start, first, last, out[j])
+
+
+@_jit
+def _add_thin(peak, cx, cy, p, s, q, reach, out):
+    """Add a Gaussian much thinner than a pixel, integrated over each."""
+    half_y = sqrt(reach / q) + 0.5
+    half_x = sqrt(reach * (1 / p + s * s / q)) + 0.5
+    first = max(0, ceil(cx - half_x))
+    last = min(out.shape[1] - 1, floor(cx + half_x))
+    low, high = max(0, ceil(cy - half_y)), min(out.shape[0] - 1, cy + half_y)
+    if first > last:
+        return
+    for j in range(low, floor(high) + 1):
+        _add_integrated_row(peak, first - cx, j - cy, p, s, q,
+                            out[j, first:last + 1])
+
+
+@_jit
+def render_image(x, y, flux, nodes, x_grid, y_grid, integrated, faintest,
+                 bottom, out):
+    """
+    Add stars (n,) in the order given to out, detector rows bottom and up.
+
+    The order of the stars alone decides about rounding: a band of rows has
+    the pixels it would have in the whole image.
+    """
+    index = np.empty(4, np.int64)
+    weights = np.empty((3, 4))
+    scratch = np.empty((3, _LIMITS.size))
+    for i in range(x.size):
+        blend_weights(x[i], y[i], x_grid, y_grid, index, weights)
+        for corner in range(4):
+            share = weights[0, corner] * flux[i]
+            if share == 0:
+                continue
+            for k in range(nodes.shape[1]):
+                a, mx, my, p, s, q = nodes[index[corner], k]
+                if a == 0:
+                    continue
+                cx, cy = x[i] + mx, y[i] + my - bottom
+                reach = 2 * log(max(abs(share * a) / faintest, 1 / _DEPTH))
+                if integrated:
+                    _add_integrated(share * a, cx, cy, p, s, q, reach,
+                                    scratch, out)
+                else:
+                    _add_sampled(share * a, cx, cy, p, s, q, reach, out)
 # Least-squares fits of a mixture to a stamp. Everything is in stamp pixels
 # about a centre near the middle of the stamp. A Gaussian of flux f is a row of
 # five shape numbers, x, y, log l, t, log m, the mean and the Cholesky factor
@@ -450,9 +623,7 @@ def draw_unit(shapes, cx, cy, images):
 
 @_jit
 def _moments_of_product(a, b, weight, cx, cy, order, out):
-    """
-    Put sum_pixels w a b x^n y^m into out[n, m] for n + m <= order <= 4.
-    """
+    """Put sum_pixels w a b x^n y^m into out[n, m], n + m <= order <= 4."""
     out[:order + 1, :order + 1] = 0.0
     for i in range(a.shape[1]):
         s0, s1, s2, s3, s4 = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -608,12 +779,31 @@ def _solve_subset(gram, rhs, active, x, work):
 
 
 @_jit
+def _steepest(gram, rhs, active, x):
+    """Return the inactive unknown that would lower the cost most, or -1."""
+    best, gain = -1, 0.0
+    for i in range(rhs.size):
+        if active[i]:
+            continue
+        slope = rhs[i]
+        for j in range(rhs.size):
+            slope -= gram[i, j] * x[j]
+        if slope > 1e-12 * abs(rhs[i]) + gain:
+            best, gain = i, slope
+    return best
+
+
+@_jit
 def _solve_fluxes(gram, rhs, signed, x, active, work):
     """
-    Solve min |G x - z| given gram = G^T G and rhs = G^T z; x >= 0 unless signed.
+    Solve min |G x - z| given gram = G^T G and rhs = G^T z.
 
-    Lawson and Hanson's active set, started from all unknowns free. work is
-    (n, n + 1).
+    Unless signed, x >= 0: Lawson and Hanson's active set, started from all
+    unknowns free. work is (n, n + 1).
+    Solve min |G x - z| with x >= 0, unless signed.
+
+    gram is G^T G, rhs G^T z. Lawson and Hanson's active set, started from
+    all unknowns free. work is (n, n + 1).
     """
     n = rhs.size
     active[:] = True
@@ -626,15 +816,7 @@ def _solve_fluxes(gram, rhs, signed, x, active, work):
             active[worst] = False
             _solve_subset(gram, rhs, active, x, work)
             continue
-        best, gain = -1, 0.0
-        for i in range(n):
-            if active[i]:
-                continue
-            slope = rhs[i]
-            for j in range(n):
-                slope -= gram[i, j] * x[j]
-            if slope > 1e-12 * abs(rhs[i]) + gain:
-                best, gain = i, slope
+        best = _steepest(gram, rhs, active, x)
         if best < 0:
             return
         active[best] = True
@@ -671,7 +853,7 @@ def penalty(shape, limits, matrix, gradient):
     receive its share of the normal equations.
     """
     x, y, log_l, t, log_m = shape
-    length, m = exp(log_l), exp(log_m)
+    m = exp(log_m)
     stiffness = limits[_STIFFNESS]
     slopes = np.zeros(5)
     slopes[2] = 1.0
@@ -938,3 +1120,867 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
         damping = max(damping * max(0.2, 1 - quality ** 3), 1e-15)
         growth = 2.0
     return cost, FIT_STOPPED, max_steps
+
+
+@_jit
+def bleed(columns, full_well):
+    """
+    Spread the charge above the full well along each column (n, ny), in place.
+
+    Half of the excess of a pixel goes each way, into the nearest pixels with
+    room; what reaches an end is lost.
+    """
+    ny = columns.shape[1]
+    excess = np.empty(ny)
+    for column in columns:
+        for j in range(ny):
+            excess[j] = 0.5 * max(0.0, column[j] - full_well)
+            column[j] = min(column[j], full_well)
+        for way in range(2):
+            carried = 0.0
+            for step in range(ny):
+                j = step if way == 0 else ny - 1 - step
+                carried += excess[j]
+                room = full_well - column[j]
+                if carried >= room:
+                    carried -= room
+                    column[j] = full_well
+                else:
+                    column[j] += carried
+                    carried = 0.0
+# Adaptive moments: the elliptical Gaussian weight W that matches what it
+# weighs, centroid to centroid and covariance M to twice the weighted one. The
+# state is x, y, M_xx, M_xy, M_yy; sums are of W times 1, u, v, uu, uv, vv over
+# the light, with (u, v) the offset from x, y.
+
+MOMENTS_CONVERGED, MOMENTS_STOPPED, MOMENTS_EMPTY, MOMENTS_DIVERGED = range(4)
+
+
+@_jit
+def _row_of(state, row):
+    """Put the Gaussian of unit peak that a state describes into row (6,)."""
+    x, y, xx, xy, yy = state
+    row[0], row[1], row[2] = 1.0, x, y
+    row[4] = xy / yy
+    row[3] = 1 / (xx - row[4] * xy)
+    row[5] = 1 / yy
+
+
+@_jit
+def _image_sums(image, used, fill, row, line, sums):
+    """
+    Sum an image under the weight of a row; unused pixels hold fill * W.
+
+    line (nx,) is scratch.
+    """
+    _, x, y, p, s, q = row
+    sums[:] = 0.0
+    for j in range(image.shape[0]):
+        v = j - y
+        if q * v * v > _LOG_NOTHING:
+            continue
+        line[:] = 0.0
+        _add_row(exp(-0.5 * q * v * v), -x - s * v, p, line)
+        s0, s1, s2 = 0.0, 0.0, 0.0
+        for i in range(line.size):
+            value = image[j, i] if used[j, i] else fill * line[i]
+            h = value * line[i]
+            u = i - x
+            s0 += h
+            s1 += h * u
+            s2 += h * u * u
+        sums[0] += s0
+        sums[1] += s1
+        sums[2] += v * s0
+        sums[3] += s2
+        sums[4] += v * s1
+        sums[5] += v * v * s0
+
+
+@_jit
+def _mixture_sums(mixture, state, sums):
+    """Integrate a mixture (K, 6: weight, x, y, xx, xy, yy) under a state."""
+    x, y, xx, xy, yy = state
+    sums[:] = 0.0
+    norm = sqrt(xx * yy - xy * xy)
+    for k in range(mixture.shape[0]):
+        weight, mx, my, sxx, sxy, syy = mixture[k]
+        a, b, c = xx + sxx, xy + sxy, yy + syy
+        determinant = a * c - b * b
+        dx, dy = mx - x, my - y
+        # (M + S)^-1 d, then M times it: the mean of the product.
+        ex = (c * dx - b * dy) / determinant
+        ey = (a * dy - b * dx) / determinant
+        h = (weight * norm / sqrt(determinant)
+             * exp(-0.5 * (dx * ex + dy * ey)))
+        u, v = xx * ex + xy * ey, xy * ex + yy * ey
+        # M (M + S)^-1 S: the covariance of the product.
+        tx, ty = (c * sxx - b * sxy) / determinant, (
+            a * sxy - b * sxx) / determinant
+        wx, wy = (c * sxy - b * syy) / determinant, (
+            a * syy - b * sxy) / determinant
+        sums[0] += h
+        sums[1] += h * u
+        sums[2] += h * v
+        sums[3] += h * (xx * tx + xy * ty + u * u)
+        sums[4] += h * (xx * wx + xy * wy + u * v)
+        sums[5] += h * (xy * wx + yy * wy + v * v)
+
+
+@_jit
+def _adapt(state, sums, largest):
+    """
+    Move the state towards the match; return its relative change.
+
+    If the light is a Gaussian of covariance S the weighted covariance C
+    obeys C^-1 = M^-1 + S^-1 and the centroid moves by C S^-1 of the way, so
+    S and the centre follow in one step. A negative value is a failure.
+    """
+    if not sums[0] > 0:
+        return -1.0
+    xx, xy, yy = state[2:]
+    u, v = sums[1] / sums[0], sums[2] / sums[0]
+    cxx = sums[3] / sums[0] - u * u
+    cxy = sums[4] / sums[0] - u * v
+    cyy = sums[5] / sums[0] - v * v
+    determinant = cxx * cyy - cxy * cxy
+    if not (cxx > 0 and determinant > 0):
+        return -2.0
+    area = xx * yy - xy * xy
+    pxx = cyy / determinant - yy / area
+    pxy = -cxy / determinant + xy / area
+    pyy = cxx / determinant - xx / area
+    precision = pxx * pyy - pxy * pxy
+    if pxx > 0 and precision > 0.05 / area:
+        nxx, nxy, nyy = pyy / precision, -pxy / precision, pxx / precision
+    else:
+        # No Gaussian of finite size would look like this; grow carefully.
+        nxx, nxy, nyy = 4 * cxx, 4 * cxy, 4 * cyy
+    if not nxx + nyy < largest:
+        return -2.0
+    # How far the centre is: (1 + S M^-1) times the weighted offset.
+    gx = u + (nxx * (yy * u - xy * v) + nxy * (xx * v - xy * u)) / area
+    gy = v + (nxy * (yy * u - xy * v) + nyy * (xx * v - xy * u)) / area
+    size = xx + yy
+    change = max(abs(nxx - xx), abs(nxy - xy), abs(nyy - yy)) / size
+    step = sqrt((gx * gx + gy * gy) / size)
+    change = max(change, step)
+    shrink = min(1.0, 2 / step) if step > 0 else 1.0
+    state[0] += shrink * gx
+    state[1] += shrink * gy
+    state[2], state[3], state[4] = nxx, nxy, nyy
+    return change
+
+
+@_jit
+def _ending(change):
+    if change == -1.0:
+        return MOMENTS_EMPTY
+    if change == -2.0:
+        return MOMENTS_DIVERGED
+    return MOMENTS_CONVERGED
+
+
+@_jit
+def adapt_to_images(images, used, states, tolerance, max_steps, largest,
+                    sums, status):
+    """
+    Bring the states (n, 5) to the adaptive moments of images (n, ny, nx).
+
+    used tells which pixels count; the others are filled with the matching
+    Gaussian. sums (n, 6) receives the last sums, status (n,) how it ended.
+    """
+    row = np.empty(6)
+    line = np.empty(images.shape[2])
+    for i in range(images.shape[0]):
+        state = states[i]
+        fill = 0.0
+        status[i] = MOMENTS_STOPPED
+        for _ in range(max_steps):
+            _row_of(state, row)
+            _image_sums(images[i], used[i], fill, row, line, sums[i])
+            area = state[2] * state[4] - state[3] * state[3]
+            fill = sums[i, 0] / (np.pi * sqrt(area))
+            change = _adapt(state, sums[i], largest)
+            if change < tolerance:
+                status[i] = _ending(change)
+                break
+
+
+@_jit
+def adapt_to_mixtures(mixtures, states, tolerance, max_steps, largest, sums,
+                      status):
+    """Bring the states (n, 5) to the moments of mixtures (n, K, 6)."""
+    for i in range(mixtures.shape[0]):
+        status[i] = MOMENTS_STOPPED
+        for _ in range(max_steps):
+            _mixture_sums(mixtures[i], states[i], sums[i])
+            change = _adapt(states[i], sums[i], largest)
+            if change < tolerance:
+                status[i] = _ending(change)
+                break
+# Fits of stars: flux, x and y of each, by Levenberg-Marquardt.
+#
+# A group of n stars is fitted jointly on the pixels of its n boxes, (first
+# row, first column, height, width) each; a single star is a group of one.
+# Where boxes overlap their pixels count once for each box. Parameters are
+# ordered flux, x, y of the first star, of the second, ..., and last, where it
+# is fitted, the sky level common to the group.
+
+# Outcome of a fit; 1 to 4 as scipy.optimize.least_squares counts them.
+_NOT_CONVERGED = 0
+_CONVERGED = 3
+_STALLED = 2
+_BAD_ERROR = -1
+
+# Stars whose unit-flux image is nowhere above this in a box are left out of
+# its normal matrix (not of its model).
+_UNSEEN = 1e-18
+
+# Fits stop when the next step is expected to be below this, in pixels and as
+# a fraction of the flux.
+_STEP_TOLERANCE = 1e-6
+
+
+# The PSF of a star and its derivatives by position are summed in a tile, one
+# flat array: for each pixel column _LANES values of the PSF, as many of its
+# derivative by x_0, and as many by y_0. Neighbouring rows are neighbours in
+# memory and fixed offsets lie between the parts, so that the compiler works on
+# several rows at once.
+_LANES = 32
+
+
+@_jit
+def _walk_starts(a, dx, dy, p, s, q, w, wy, height, walk):
+    """
+    Put what a walk along the columns starts from into walk (4, _LANES) flat.
+
+    For each row the Gaussian in the first column, its quotient with the next
+    one, p u, and the factor of the Gaussian in its derivative by y. Returns
+    whether anything is there. The values of the first column are a Gaussian
+    in y, walked outward from its peak.
+    """
+    t = q + s * s * p
+    u = dx
+    slope = q * dy - p * s * u
+    top = min(max(int(np.rint(-slope / t)), 0), height - 1)
+    u -= s * top
+    slope += t * top
+    drop = exp(-t)
+    first = a * exp(-0.5 * (p * u * u + q * (dy + top) ** 2))
+    if abs(first) < _NOTHING:
+        return False
+    g = first
+    r = exp(-slope - 0.5 * t)
+    for j in range(top, height):
+        walk[j] = g
+        g *= r
+        r *= drop
+    g = first
+    r = exp(slope - 0.5 * t)
+    for j in range(top - 1, -1, -1):
+        g *= r
+        r *= drop
+        walk[j] = g
+    r = exp(-p * (dx + 0.5))
+    grow = exp(p * s)
+    for j in range(height):
+        walk[_LANES + j] = r
+        r *= grow
+    for j in range(height):
+        walk[2 * _LANES + j] = p * (dx - s * j)
+        walk[3 * _LANES + j] = w * q * (dy + j) + wy
+    return True
+
+
+@_jit
+def _add_walk(p, s, w, wx, height, width, walk, tile):
+    """Add a Gaussian to a tile, two multiplications a pixel."""
+    fall = exp(-p)
+    for i in range(width):
+        column = 3 * _LANES * i
+        for j in range(height):
+            g = walk[j]
+            r = walk[_LANES + j]
+            pu = walk[2 * _LANES + j]
+            h = pu * g
+            tile[column + j] += w * g
+            tile[column + _LANES + j] += w * h + wx * g
+            tile[column + 2 * _LANES + j] += (
+                walk[3 * _LANES + j] * g - w * s * h)
+            walk[j] = g * r
+            walk[_LANES + j] = r * fall
+            walk[2 * _LANES + j] = pu + p
+
+
+@_jit
+def _add_pixel(g, by_x, by_y, w, wx, wy, i, j, tile):
+    """Add a Gaussian and its derivatives in one pixel, weighted."""
+    k = 3 * _LANES * i + j
+    tile[k] += w * g
+    tile[k + _LANES] += w * by_x + wx * g
+    tile[k + 2 * _LANES] += w * by_y + wy * g
+
+
+@_jit
+def _add_points(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
+                tile):
+    """Add a Gaussian to a tile, each pixel for itself."""
+    for i in range(width):
+        for j in range(height):
+            u, v = dx + i, dy + j
+            g = a * _value(u, v, p, s, q, integrated)
+            gx, gy = _gradient(u, v, p, s, q, integrated)
+            _add_pixel(g, -a * gx, -a * gy, w, wx, wy, i, j, tile)
+
+
+@_jit
+def _add_gaussian(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
+                  walk, tile):
+    """
+    Add a Gaussian, its first pixel at (dx, dy) from the peak, to a tile.
+
+    w is its share in the blend, wx and wy the slopes of the share.
+    """
+    left = min(dx - s * dy, dx - s * (dy + height - 1))
+    # A walk that begins too far out begins at zero.
+    steep = (p > 50 or q > 50 or p * abs(s) * height > 200
+             or (left < 0 and p * left * left > 600))
+    if integrated or steep:
+        _add_points(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
+                    tile)
+    elif _walk_starts(a, dx - s * dy, dy, p, s, q, w, wy, height, walk):
+        _add_walk(p, s, w, wx, height, width, walk, tile)
+
+
+@_jit
+def _fill_jet(x_0, y_0, box, psf, tiling, jet):
+    """
+    Put the unit-flux PSF in a box and its derivatives by x_0 and y_0.
+
+    They go into jet (3, width * height), column after column. psf is (nodes,
+    x_grid, y_grid, integrated), tiling is scratch (walk, tile, index,
+    weights). The change of the blend with position is included.
+    """
+    nodes, x_grid, y_grid, integrated = psf
+    walk, tile, index, weights = tiling
+    blend_weights(x_0, y_0, x_grid, y_grid, index, weights)
+    row, column, height, width = box
+    for bottom in range(0, height, _LANES):
+        rows = min(_LANES, height - bottom)
+        tile[:3 * _LANES * width] = 0.0
+        for corner in range(4):
+            w, wx, wy = (weights[0, corner], weights[1, corner],
+                         weights[2, corner])
+            if w == 0 and wx == 0 and wy == 0:
+                continue
+            for k in range(nodes.shape[1]):
+                a, mx, my, p, s, q = nodes[index[corner], k]
+                if a != 0:
+                    _add_gaussian(a, column - x_0 - mx,
+                                  row + bottom - y_0 - my, p, s, q, w, wx, wy,
+                                  integrated, rows, width, walk, tile)
+        for part in range(3):
+            for i in range(width):
+                k = (3 * i + part) * _LANES
+                to = i * height + bottom
+                for j in range(rows):
+                    jet[part, to + j] = tile[k + j]
+
+
+@_jit
+def count_pixels(mask, boxes, out):
+    """Put the number of pixels of each box that mask leaves into out (n,)."""
+    for i in range(boxes.shape[0]):
+        row, column, height, width = boxes[i]
+        n = 0
+        for y in range(row, row + height):
+            for x in range(column, column + width):
+                n += not mask[y, x]
+        out[i] = n
+
+
+@_jit
+def _gather(image, error, mask, box, sky, data, variance):
+    """
+    Copy the pixels of a box less its sky, column after column.
+
+    Masked pixels get an infinite variance. error and mask may be empty, for
+    1 and none. Returns the number of pixels, or -1 if an error is not
+    positive and finite.
+    """
+    row, column, height, width = box
+    n = 0
+    for i in range(width):
+        for j in range(height):
+            k = i * height + j
+            y, x = row + j, column + i
+            if mask.size and mask[y, x]:
+                data[k] = 0.0
+                variance[k] = np.inf
+                continue
+            data[k] = image[y, x] - sky
+            variance[k] = 1.0
+            n += 1
+            if error.size:
+                sigma = error[y, x]
+                if not 0 < sigma < np.inf:
+                    return -1
+                variance[k] = sigma * sigma
+    return n
+
+
+@_jit
+def _weigh(data, variance, sky, gain, old, residual, weight, chi2):
+    """
+    Turn the model of the stars in residual into residuals, and weigh them.
+
+    weight takes the new weights; chi2 (2,) gets the sums of squares with the
+    old weights and with the new ones added. A gain of 0 means that variance
+    does not depend on the model.
+    """
+    with_old = 0.0
+    with_new = 0.0
+    for i in range(data.size):
+        model = residual[i]
+        v = variance[i]
+        if gain > 0 and model > 0:
+            v += model / gain
+        w = 1 / v
+        r = data[i] - sky - model
+        weight[i] = w
+        residual[i] = r
+        with_old += old[i] * r * r
+        with_new += w * r * r
+    chi2[0] += with_old
+    chi2[1] += with_new
+
+
+@_jit
+def _add_gradient(jet, flux, weight, residual, gradient):
+    """Add a star's part of the right-hand side in one box."""
+    b0 = 0.0
+    b1 = 0.0
+    b2 = 0.0
+    for i in range(weight.size):
+        wr = weight[i] * residual[i]
+        b0 += wr * jet[0, i]
+        b1 += wr * jet[1, i]
+        b2 += wr * jet[2, i]
+    gradient[0] += b0
+    gradient[1] += flux * b1
+    gradient[2] += flux * b2
+
+
+@_jit
+def _add_block(one, flux_1, two, flux_2, weight, block):
+    """Add the 3 x 3 block of the normal matrix that joins two stars."""
+    a00 = 0.0
+    a01 = 0.0
+    a02 = 0.0
+    a10 = 0.0
+    a11 = 0.0
+    a12 = 0.0
+    a20 = 0.0
+    a21 = 0.0
+    a22 = 0.0
+    for i in range(weight.size):
+        w0 = weight[i] * one[0, i]
+        w1 = weight[i] * one[1, i]
+        w2 = weight[i] * one[2, i]
+        t0, t1, t2 = two[0, i], two[1, i], two[2, i]
+        a00 += w0 * t0
+        a01 += w0 * t1
+        a02 += w0 * t2
+        a10 += w1 * t0
+        a11 += w1 * t1
+        a12 += w1 * t2
+        a20 += w2 * t0
+        a21 += w2 * t1
+        a22 += w2 * t2
+    block[0, 0] += a00
+    block[0, 1] += flux_2 * a01
+    block[0, 2] += flux_2 * a02
+    block[1, 0] += flux_1 * a10
+    block[1, 1] += flux_1 * flux_2 * a11
+    block[1, 2] += flux_1 * flux_2 * a12
+    block[2, 0] += flux_1 * a20
+    block[2, 1] += flux_1 * flux_2 * a21
+    block[2, 2] += flux_1 * flux_2 * a22
+
+
+@_jit
+def _add_sky(jet, flux, weight, column):
+    """Add what joins a star and the sky level, in one box."""
+    for i in range(weight.size):
+        column[0] += weight[i] * jet[0, i]
+        column[1] += weight[i] * jet[1, i] * flux
+        column[2] += weight[i] * jet[2, i] * flux
+
+
+@_jit
+def _model_stars(parameters, n, box, psf, scratch, residual):
+    """
+    Put the sum of n stars in a box into residual.
+
+    Fills each star's jet, and whether any of it is seen in the box. scratch
+    is (jets, seen, tiling).
+    """
+    jets, seen, tiling = scratch
+    residual[:] = 0.0
+    for s in range(n):
+        jet = jets[s, :, :residual.size]
+        _fill_jet(parameters[3 * s + 1], parameters[3 * s + 2], box, psf,
+                  tiling, jet)
+        flux = parameters[3 * s]
+        top = 0.0
+        for i in range(residual.size):
+            residual[i] += flux * jet[0, i]
+            top = max(top, abs(jet[0, i]))
+        seen[s] = top > _UNSEEN
+
+
+@_jit
+def _add_equations(parameters, n, fit_sky, jets, seen, weight, residual,
+                   matrix, gradient):
+    """Add what one box contributes to the normal equations of a group."""
+    sky = 3 * n
+    for s in range(n):
+        if not seen[s]:
+            continue
+        flux = parameters[3 * s]
+        one = slice(3 * s, 3 * s + 3)
+        own = jets[s, :, :weight.size]
+        _add_gradient(own, flux, weight, residual, gradient[one])
+        for t in range(s + 1):
+            if seen[t]:
+                _add_block(own, flux, jets[t, :, :weight.size],
+                           parameters[3 * t], weight,
+                           matrix[one, 3 * t:3 * t + 3])
+        if fit_sky:
+            _add_sky(own, flux, weight, matrix[sky, one])
+    if fit_sky:
+        for i in range(weight.size):
+            matrix[sky, sky] += weight[i]
+            gradient[sky] += weight[i] * residual[i]
+
+
+@_jit
+def _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
+                      chi2):
+    """
+    Evaluate a group: normal matrix and right-hand side, chi2 (2,).
+
+    pixels is (boxes, data, variance, gain). old and new are the tuples
+    (weights, residuals, matrix, gradient) of the last point and of this one.
+    Only the lower triangle of the matrix is filled.
+    """
+    boxes, data, variance, gain = pixels
+    jets, seen, _ = scratch
+    weights, residuals, matrix, gradient = new
+    size = 3 * n + fit_sky
+    matrix[:size, :size] = 0.0
+    gradient[:size] = 0.0
+    chi2[:] = 0.0
+    sky = parameters[3 * n] if fit_sky else 0.0
+    for c in range(n):
+        used = boxes[c, 2] * boxes[c, 3]
+        residual, weight = residuals[c, :used], weights[c, :used]
+        _model_stars(parameters, n, boxes[c], psf, scratch, residual)
+        _weigh(data[c, :used], variance[c, :used], sky, gain,
+               old[0][c, :used], residual, weight, chi2)
+        _add_equations(parameters, n, fit_sky, jets, seen, weight, residual,
+                       matrix, gradient)
+
+
+@_jit
+def _factorize(matrix, frozen, damping, size, scale, factor):
+    """
+    Put the Cholesky factor of the damped, scaled matrix into factor.
+
+    scale (size,) takes the square roots of the diagonal; rows of frozen
+    parameters become those of the unit matrix. Returns whether the matrix is
+    positive definite to working precision.
+    """
+    for a in range(size):
+        d = matrix[a, a]
+        if frozen[a] or not d > 0:
+            frozen[a] = True
+            scale[a] = 1.0
+        else:
+            scale[a] = sqrt(d)
+    for a in range(size):
+        for b in range(a + 1):
+            if frozen[a] or frozen[b]:
+                value = 1.0 if a == b else 0.0
+            else:
+                value = matrix[a, b] / (scale[a] * scale[b])
+                if a == b:
+                    value += damping
+            for c in range(b):
+                value -= factor[a, c] * factor[b, c]
+            if a == b:
+                if not value > 1e-14:
+                    return False
+                factor[a, a] = sqrt(value)
+            else:
+                factor[a, b] = value / factor[b, b]
+    return True
+
+
+@_jit
+def _solve(factor, scale, size, vector):
+    """Solve for the scaled vector in place, given the Cholesky factor."""
+    for a in range(size):
+        value = vector[a] / scale[a]
+        for b in range(a):
+            value -= factor[a, b] * vector[b]
+        vector[a] = value / factor[a, a]
+    for a in range(size - 1, -1, -1):
+        value = vector[a]
+        for b in range(a + 1, size):
+            value -= factor[b, a] * vector[b]
+        vector[a] = value / factor[a, a]
+    for a in range(size):
+        vector[a] /= scale[a]
+
+
+@_jit
+def _freeze(parameters, lower, upper, gradient, fixed, size, frozen):
+    """Freeze fixed parameters and those that press against a bound."""
+    for a in range(size):
+        frozen[a] = fixed[a] or (
+            parameters[a] <= lower[a] and gradient[a] < 0) or (
+            parameters[a] >= upper[a] and gradient[a] > 0)
+
+
+@_jit
+def _step_size(step, parameters, matrix, n):
+    """
+    Return the largest relative step of a group.
+
+    In pixels for positions; for fluxes as a fraction of the flux or, if that
+    is larger, of a tenth of its error.
+    """
+    size = 0.0
+    for s in range(n):
+        a = 3 * s
+        size = max(size, abs(step[a + 1]), abs(step[a + 2]))
+        if step[a] != 0:
+            noise = 0.1 / sqrt(matrix[a, a])
+            size = max(size, abs(step[a]) / max(abs(parameters[a]), noise))
+    return size
+
+
+@_jit
+def _take_step(parameters, step, lower, upper, n, size, longest, trial):
+    """Put the bounded end of the step into trial, the actual into step."""
+    for s in range(n):
+        far = max(abs(step[3 * s + 1]), abs(step[3 * s + 2]))
+        if far > longest:
+            step[3 * s + 1] *= longest / far
+            step[3 * s + 2] *= longest / far
+    for a in range(size):
+        trial[a] = min(max(parameters[a] + step[a], lower[a]), upper[a])
+        step[a] = trial[a] - parameters[a]
+
+
+@_jit
+def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
+              limits, max_iterations, longest, chi2):
+    """
+    Minimize chi2 of a group by Levenberg-Marquardt, from parameters.
+
+    Returns the outcome and the number of evaluations; old holds the
+    equations at the result, chi2[1] its sum of squares. work is (step,
+    trial, frozen, scale, factor), limits (lower, upper, fixed).
+    """
+    step, trial, frozen, scale, factor = work
+    lower, upper, fixed = limits
+    size = 3 * n + fit_sky
+    _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, old,
+                      chi2)
+    best = chi2[1]
+    floor = 1e-24 * best
+    damping = 0.0
+    last = 1.0
+    for iteration in range(max_iterations):
+        _freeze(parameters, lower, upper, old[3], fixed, size, frozen)
+        if not _factorize(old[2], frozen, damping, size, scale, factor):
+            damping = max(10 * damping, 1e-6)
+            if damping > 1e3:
+                return _NOT_CONVERGED, iteration + 1
+            continue
+        for a in range(size):
+            step[a] = 0.0 if frozen[a] else old[3][a]
+        _solve(factor, scale, size, step)
+        _take_step(parameters, step, lower, upper, n, size, longest, trial)
+        length = _step_size(step, parameters, old[2], n)
+        _normal_equations(trial, n, fit_sky, pixels, psf, scratch, old, new,
+                          chi2)
+        if not chi2[0] <= best * (1 + 1e-12) + floor:
+            if length < 1e-3 * _STEP_TOLERANCE or damping > 1e12:
+                return _STALLED, iteration + 2
+            damping = max(10 * damping, 1e-3)
+            last = 1.0
+            continue
+        parameters[:size] = trial[:size]
+        best = chi2[1]
+        for source, target in ((new[0], old[0]), (new[1], old[1])):
+            target[:n] = source[:n]
+        old[2][:size, :size] = new[2][:size, :size]
+        old[3][:size] = new[3][:size]
+        # Convergence is linear at the worst: the next step is expected to
+        # be shorter than this one by the factor this one was.
+        if damping == 0 and length * min(1.0, length / last) < _STEP_TOLERANCE:
+            return _CONVERGED, iteration + 2
+        last = length
+        damping = damping / 10 if damping > 1e-5 else 0.0
+    return _NOT_CONVERGED, max_iterations + 1
+
+
+@_jit
+def _covariances(matrix, fixed, n, size, work, out):
+    """
+    Put each star's 3 x 3 block of the inverse matrix into out (n, 3, 3).
+
+    Returns the variance of the last parameter, or NaN if there is no inverse;
+    then out is NaN, too.
+    """
+    step, _, frozen, scale, factor = work
+    for a in range(size):
+        frozen[a] = fixed[a]
+    if not _factorize(matrix, frozen, 0.0, size, scale, factor):
+        out[:n] = np.nan
+        return np.nan
+    for a in range(size):
+        step[:size] = 0.0
+        step[a] = 1.0
+        _solve(factor, scale, size, step)
+        if a < 3 * n:
+            s = a // 3
+            for b in range(3):
+                out[s, a - 3 * s, b] = step[3 * s + b]
+                if frozen[a] or frozen[3 * s + b]:
+                    out[s, a - 3 * s, b] = np.nan
+    return step[size - 1]
+
+
+@_jit
+def _measure_fit(x_init, y_init, boxes, weights, residuals, n, out):
+    """
+    Put three sums of each star's box into out (n, 3).
+
+    They are the sum of absolute residuals, the residual of the pixel at the
+    initial position, NaN where it was not fitted, and the sum of squares.
+    """
+    for s in range(n):
+        row, column, height, width = boxes[s]
+        total = 0.0
+        squares = 0.0
+        for i in range(height * width):
+            if weights[s, i] > 0:
+                total += abs(residuals[s, i])
+                squares += weights[s, i] * residuals[s, i] ** 2
+        x = int(ceil(x_init[s] - 0.5)) - column
+        y = int(ceil(y_init[s] - 0.5)) - row
+        centre = np.nan
+        if 0 <= x < width and 0 <= y < height and weights[
+                s, x * height + y] > 0:
+            centre = residuals[s, x * height + y]
+        out[s, 0] = total
+        out[s, 1] = centre
+        out[s, 2] = squares
+
+
+@_jit
+def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
+              fixed, fit_sky, gain, nodes, x_grid, y_grid, integrated,
+              max_iterations, fitted, fitted_sky, covariances, sums, outcome):
+    """
+    Fit flux, x and y of groups of stars.
+
+    The stars of group g are starts[g] to starts[g + 1]. initial, lower and
+    upper are (n, 3); fixed (3,) holds for all; sky (n,) is subtracted before
+    the fit, and fit_sky adds one level for each group. Results: fitted
+    (n, 3), fitted_sky (n, 2) with its error, covariances (n, 3, 3), sums
+    (n, 3) as of _measure_fit, outcome (n, 2) with the number of evaluations.
+    """
+    most = 1
+    area = 1
+    for g in range(starts.size - 1):
+        most = max(most, starts[g + 1] - starts[g])
+    for i in range(boxes.shape[0]):
+        area = max(area, boxes[i, 2] * boxes[i, 3])
+    size = 3 * most + 1
+    psf = (nodes, x_grid, y_grid, integrated)
+    data, variance = np.empty((most, area)), np.empty((most, area))
+    old = (np.zeros((most, area)), np.empty((most, area)),
+           np.empty((size, size)), np.empty(size))
+    new = (np.zeros((most, area)), np.empty((most, area)),
+           np.empty((size, size)), np.empty(size))
+    tiling = (np.empty(4 * _LANES), np.empty(3 * _LANES * area),
+              np.empty(4, np.int64), np.empty((3, 4)))
+    scratch = (np.empty((most, 3, area)), np.empty(most, np.bool_), tiling)
+    work = (np.empty(size), np.empty(size), np.empty(size, np.bool_),
+            np.empty(size), np.empty((size, size)))
+    limits = (np.empty(size), np.empty(size), np.empty(size, np.bool_))
+    parameters = np.empty(size)
+    chi2 = np.empty(2)
+    for g in range(starts.size - 1):
+        first, n = starts[g], starts[g + 1] - starts[g]
+        stars = slice(first, first + n)
+        n_pixels = 0
+        longest = 1.0
+        for s in range(n):
+            i = first + s
+            got = _gather(image, error, mask, boxes[i], sky[i], data[s],
+                          variance[s])
+            if got < 0:
+                outcome[i, 0] = _BAD_ERROR
+                n_pixels = -1
+                break
+            n_pixels += got
+            longest = max(longest, 0.25 * max(boxes[i, 2], boxes[i, 3]))
+            for b in range(3):
+                a = 3 * s + b
+                limits[0][a], limits[1][a] = lower[i, b], upper[i, b]
+                limits[2][a] = fixed[b]
+                parameters[a] = min(max(initial[i, b], lower[i, b]),
+                                    upper[i, b])
+        if n_pixels < 0:
+            continue
+        last = 3 * n
+        parameters[last] = 0.0
+        limits[0][last], limits[1][last] = -np.inf, np.inf
+        limits[2][last] = False
+        pixels = (boxes[stars], data, variance, gain)
+        status, evaluations = _minimize(
+            parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
+            limits, max_iterations, longest, chi2)
+        sky_variance = _covariances(old[2], limits[2], n, last + fit_sky,
+                                    work, covariances[stars])
+        _measure_fit(initial[stars, 1], initial[stars, 2], boxes[stars],
+                     old[0], old[1], n, sums[stars])
+        factor = 1.0
+        if error.size == 0 and gain == 0:
+            # Without errors the scatter of the residuals stands for them.
+            squares = 0.0
+            for s in range(n):
+                squares += sums[first + s, 2]
+            n_free = fit_sky
+            for b in range(3):
+                n_free += n * (not fixed[b])
+            factor = (squares / (n_pixels - n_free) if n_pixels > n_free
+                      else np.nan)
+        for s in range(n):
+            i = first + s
+            for b in range(3):
+                fitted[i, b] = parameters[3 * s + b]
+                for c in range(3):
+                    covariances[i, b, c] *= factor
+            if fit_sky:
+                fitted_sky[i, 0] = parameters[last]
+                fitted_sky[i, 1] = sqrt(factor * sky_variance)
+            outcome[i, 0] = status
+            outcome[i, 1] = evaluations
