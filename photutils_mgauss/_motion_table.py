@@ -14,7 +14,6 @@ from photutils_mgauss._joint import parallax_leak, parts, run, solve_all
 from photutils_mgauss._parallax import tdb
 from photutils_mgauss._stacked import invert_2x2
 from photutils_mgauss._tangent_plane import directions
-from photutils_mgauss.alignment import judge
 
 # What each bit of a star's flags means.
 FLAGS = {
@@ -132,14 +131,14 @@ def _add_parameters(table, fit, values, covariance):
     has_parallax = bool(fit.scene.options.parallax)
     values, covariance, extra = _gaia_order(values, covariance, has_parallax,
                                             fit.scene.options.acceleration)
-    sigma = np.sqrt(np.stack([covariance[k, k] for k in range(5)]))
+    sigma = [np.sqrt(covariance[k][k]) for k in range(5)]
     units = (unit, unit, unit, unit / u.yr, unit / u.yr)
     plane = fit.scene.sightings.plane
     if plane is not None:
-        ra, dec = directions(plane.deproject(values[:2]))
+        ra, dec = directions(plane.deproject(np.stack(values[:2])))
         table['ra'], table['dec'] = ra * u.deg, dec * u.deg
     else:
-        table['x'], table['y'] = values[:2] * unit
+        table['x'], table['y'] = (value * unit for value in values[:2])
     for k, name in enumerate(GAIA):
         if k > 1:
             table[name] = values[k] * units[k]
@@ -147,7 +146,7 @@ def _add_parameters(table, fit, values, covariance):
     for i in range(5):
         for j in range(i + 1, 5):
             with np.errstate(invalid='ignore'):
-                rho = covariance[i, j] / (sigma[i] * sigma[j])
+                rho = covariance[i][j] / (sigma[i] * sigma[j])
             table[f'{GAIA[i]}_{GAIA[j]}_corr'] = rho
     for k, name in enumerate(('accra', 'accdec')):
         if extra is not None:
@@ -163,11 +162,11 @@ def _gaia_order(values, covariance, has_parallax, acceleration):
         extra = values[-2:], np.sqrt(np.stack([covariance[-2, -2],
                                                covariance[-1, -1]]))
     size = 5 if has_parallax else 4
-    full = np.full((5, n), np.nan)
-    full[:size] = values[:size]
-    matrix = np.full((5, 5, n), np.nan)
-    matrix[:size, :size] = covariance[:size, :size]
-    return full[FROM_OURS], matrix[FROM_OURS][:, FROM_OURS], extra
+    nothing = np.full(n, np.nan)
+    full = [values[k] if k < size else nothing for k in FROM_OURS]
+    matrix = [[covariance[j, k] if max(j, k) < size else nothing
+               for k in FROM_OURS] for j in FROM_OURS]
+    return full, matrix, extra
 
 
 def _flags(fit):
@@ -324,9 +323,10 @@ def residual_table(fit):
     epoch, star = np.nonzero(sightings.matches.seen)
     at = (epoch, star)
     full = solve_all(fit.problem, fit.frames.correction, fit.frames.factor,
-                     scene.options.executor, residuals=True, leverage=True)
-    covariance = measured(scene, fit.state)
-    judgement = judge(full, covariance, fit.problem.weights)
+                     scene.options.executor, residuals=True, leverage=True,
+                     judge=True)
+    covariance = np.stack([measured(scene, fit.state, e)
+                           for e in range(len(fit.state.maps))], axis=1)
     unit = u.Unit(sightings.unit)
     finite = np.isfinite(sightings.places).all(axis=0)
     table = QTable({'epoch': epoch, 'id': sightings.names[star],
@@ -335,12 +335,12 @@ def residual_table(fit):
     table['time'] = years * u.yr
     _add_aligned(table, fit, at, finite, unit)
     residual = np.where(finite, full.residuals, np.nan)
-    left_out = _leave_one_out(full, covariance, judgement)
+    left_out = _leave_one_out(full, covariance)
     for k, name in enumerate(('dra', 'ddec')):
         table[name] = residual[k][at] * unit
         table[f'{name}_error'] = np.sqrt(covariance[2 * k][at]) * unit
         table[f'{name}_left_out'] = left_out[k][at] * unit
-    table['chi2'] = judgement.chi2[at]
+    table['chi2'] = full.chi2[at]
     table['used'] = fit.state.used[at]
     return table
 
@@ -356,7 +356,7 @@ def _add_aligned(table, fit, at, finite, unit):
         table['x'], table['y'] = (axis[at] * unit for axis in aligned)
 
 
-def _leave_one_out(estimates, covariance, judgement):
+def _leave_one_out(estimates, covariance):
     """Return residuals (2, E, n) from fits without the detection itself."""
     x, y = estimates.residuals
     left = invert_2x2(*(covariance - estimates.predicted))
@@ -365,4 +365,4 @@ def _leave_one_out(estimates, covariance, judgement):
     with np.errstate(invalid='ignore'):
         a, b = left[0] * x + left[1] * y, left[1] * x + left[2] * y
         out = np.stack([xx * a + xy * b, xy * a + yy * b])
-    return np.where(np.isfinite(judgement.chi2), out, np.nan)
+    return np.where(np.isfinite(estimates.chi2), out, np.nan)
