@@ -1,6 +1,4 @@
-"""
-From epochs and references to arrays: read, matched, and put on one plane.
-"""
+"""From epochs and references to arrays: matched, and on one plane."""
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -281,7 +279,7 @@ def _lookup(ids, names):
 
 
 def _named_references(references, names, matches, epochs):
-    """References given as identifiers, or as the name of a column."""
+    """Return the stars that identifiers or a column mark as references."""
     if isinstance(references, str):
         marked = np.zeros(len(names), dtype=bool)
         for epoch, rows in zip(epochs, matches.rows, strict=True):

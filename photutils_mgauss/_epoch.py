@@ -293,6 +293,7 @@ def read_epoch(epoch, plane=None, vectors=None):
     found = np.isfinite(positions).all(axis=0)
     years = np.asarray(epoch.years, dtype=float)
     found &= np.isfinite(years)
+    positions = np.where(found, positions, np.nan)
     usable = found & _positive_definite(covariance)
     return Detections(_ids(epoch.table), vectors, positions, covariance,
                       years, _flux(epoch.table), found, usable)

@@ -1,6 +1,4 @@
-"""
-The loop behind `ProperMotionFitter`: solve, judge, reject, and again.
-"""
+"""The loop behind `ProperMotionFitter`: solve, judge, reject, and again."""
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +12,11 @@ from photutils_mgauss._joint import (
     solve_all,
 )
 from photutils_mgauss._references import build_priors, perspective
+from photutils_mgauss._relative import (
+    Family,
+    mean_weights,
+    remove_mean_field,
+)
 from photutils_mgauss._stacked import invert_2x2
 from photutils_mgauss.alignment import (
     Frames,
@@ -39,6 +42,7 @@ class Options:
     acceleration: bool
     systematic: object
     clip: float | None
+    max_motion: float
     hold_out: float
     rng: object
     executor: object
@@ -73,13 +77,15 @@ class State:
     What changes from one iteration to the next.
 
     ``maps`` (E, 2, b), ``used`` (E, n), ``floor`` (E,) variances per axis,
-    ``dropped`` (k,) stars that are references no longer.
+    ``dropped`` (k,) stars that are references no longer, ``untied`` (n,)
+    stars whose detections disagree too much to find the frames with.
     """
 
     maps: np.ndarray
     used: np.ndarray
     floor: np.ndarray
     dropped: np.ndarray
+    untied: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +126,25 @@ def prepare(sightings, epochs, options):
     _check_references(scene)
     maps = np.repeat(transform.identity()[None], len(dt), axis=0)
     return scene, State(maps, sightings.usable.copy(), _first_floor(scene),
-                        np.empty(0, dtype=int))
+                        np.empty(0, dtype=int), _scattered(scene))
+
+
+def _scattered(scene):
+    """
+    Return stars (n,) whose places are too far apart to be one star.
+
+    Identifiers may be wrong, and one such star would outweigh all others.
+    """
+    places = np.where(scene.sightings.usable, scene.sightings.places, np.nan)
+    count = scene.sightings.usable.sum(axis=0)
+    many = np.flatnonzero(count > 1)
+    spread = np.zeros(len(count))
+    spread[many] = (np.nanmax(places[..., many], axis=1)
+                    - np.nanmin(places[..., many], axis=1)).max(axis=0)
+    typical = spread[scene.anchors & (count > 1)]
+    limit = 30 * np.median(typical) if len(typical) else 0.0
+    baseline = np.ptp(scene.sightings.epoch_years)
+    return spread > max(limit, scene.options.max_motion * baseline)
 
 
 def _check_parallax(options, observer):
@@ -169,7 +193,7 @@ def _select(catalogue, which, n):
 
 
 def _hold_out(stars, options):
-    n = int(round(options.hold_out * len(stars)))
+    n = round(options.hold_out * len(stars))
     if n == 0:
         return np.empty(0, dtype=int)
     rng = np.random.default_rng(options.rng)
@@ -272,10 +296,9 @@ def measured(scene, state):
 
 def _ties(scene, state):
     """Return which stars take part in finding the frames."""
-    n = scene.origin.shape[1]
     if scene.options.recipe == 'joint' or scene.relative:
-        return np.ones(n, dtype=bool)
-    ties = scene.anchors.copy()
+        return ~state.untied
+    ties = scene.anchors & ~state.untied
     ties[state.dropped] = False
     return ties
 
@@ -313,10 +336,18 @@ def change(scene, frames):
 
 def align(scene, state):
     """Iterate until the maps stand still."""
-    for _ in range(MAX_ITERATIONS):
+    before = np.inf
+    for i in range(MAX_ITERATIONS):
         problem, frames, state = step(scene, state)
-        if change(scene, frames) < CONVERGED:
+        size = change(scene, frames)
+        if size < CONVERGED:
             break
+        if i > 5 and not size < before:
+            msg = ('epochs must agree on which star is which, got frames '
+                   f'that still differ by {size:.1g} standard errors: are '
+                   'the identifiers those of the same stars?')
+            raise ValueError(msg)
+        before = size
     return problem, frames, state
 
 
@@ -352,7 +383,40 @@ def fit(scene, state):
             break
     estimates = solve_all(problem, frames.correction, frames.factor,
                           scene.options.executor, residuals=True)
+    if scene.relative and scene.transform.kind != 'none':
+        state, estimates = _relative(scene, state, problem, frames,
+                                     estimates)
     return Fit(scene, state, problem, frames, estimates)
+
+
+def families(scene):
+    """Return the common fields that stars without references may have."""
+    generators, dt = scene.transform.generators, scene.dt.mean(axis=1)
+    out = [Family((2, 3), generators, np.multiply.outer(dt, generators))]
+    if scene.options.acceleration:
+        p = n_star_parameters(scene.options)
+        out.append(Family((p - 2, p - 1), generators,
+                          np.multiply.outer(dt**2 / 2, generators)))
+    if scene.options.parallax is True:
+        family = gauge_of(scene).parallaxes
+        b, m = scene.transform.n_terms, family.shape[1]
+        if m:
+            out.append(Family((4,), np.eye(b)[:, :m],
+                              family.reshape(len(dt), 2 * b, m)))
+    return out
+
+
+def _relative(scene, state, problem, frames, estimates):
+    """Return state and estimates with the stars' mean fields at zero."""
+    maps = state.maps
+    for family in families(scene):
+        weights = mean_weights(estimates.values, estimates.covariance,
+                               list(family.rows), problem.ties)
+        estimates, field = remove_mean_field(
+            problem, frames, estimates, family, weights,
+            scene.options.executor)
+        maps = maps - (family.drifts @ field).reshape(maps.shape)
+    return replace(state, maps=maps), estimates
 
 
 def _typical(scene):
@@ -377,9 +441,23 @@ def _review(scene, state, problem, frames, fits_floor):
                                                  dropped)), True
     bad = worst_outliers(judgement, state.used, _spare(problem, state),
                          scene.options.clip)
-    if not bad.any():
-        return state, False
-    return replace(state, used=state.used & ~bad), True
+    if bad.any():
+        return replace(state, used=state.used & ~bad), True
+    untied = state.untied | _inconsistent(scene, problem, estimates)
+    return replace(state, untied=untied), bool(
+        (untied & ~state.untied).any())
+
+
+def _inconsistent(scene, problem, estimates):
+    """Return stars (n,) that no more rejections can make agree."""
+    dof = 2 * (problem.weights[0] > 0).sum(axis=0) - problem.n_parameters
+    tail = 2 * stats.norm.sf(scene.options.clip)
+    chi2 = np.nan_to_num(data_chi2(estimates, problem), nan=0.0)
+    out = (dof > 0) & (chi2 > stats.chi2.isf(tail, np.maximum(dof, 1)))
+    # References agree with their catalogue, or are none any more.
+    out[problem.priors.stars] &= ~scene.anchors[problem.priors.stars] | (
+        scene.relative)
+    return out
 
 
 def _spare(problem, state):

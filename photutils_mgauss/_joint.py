@@ -31,12 +31,12 @@ evaluated at the mean place of a star, not at each measured one: the two agree
 once the maps have converged, and only with a common basis are shifts of all
 frames together exactly undetermined, as they must be.
 """
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from os import cpu_count
 
 import numpy as np
 
+from photutils_mgauss._parallel import available_cores
 from photutils_mgauss._stacked import (
     apply,
     apply_transposed,
@@ -202,12 +202,13 @@ class Problem:
 def run(executor, function, items):
     """Map ``function`` over ``items``, in threads unless told otherwise."""
     items = list(items)
-    if executor is None and len(items) > 1:
-        with ThreadPoolExecutor(cpu_count()) as pool:
-            return list(pool.map(function, items))
-    if isinstance(executor, Executor):
+    if executor is not None:
         return list(executor.map(function, items))
-    return [function(item) for item in items]
+    cores = available_cores()
+    if cores == 1 or len(items) < 2:
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(cores) as pool:
+        return list(pool.map(function, items))
 
 
 def parts(problem):
@@ -437,7 +438,8 @@ def _predicted(stars, task, scaled):
     """
     n_epochs = task.problem.n_epochs
     out = np.empty((3, *task.problem.offsets.shape[1:]))
-    blocks = task.factor.reshape(n_epochs, 2, len(stars.basis), -1)
+    blocks = task.factor.reshape(n_epochs, 2, len(stars.basis),
+                                 task.factor.shape[1])
     for e in range(n_epochs):
         rows = [_project(stars, e, c) for c in range(2)]
         frame = [np.einsum('kn,knq->nq', rows[c], scaled)

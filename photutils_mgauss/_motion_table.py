@@ -1,6 +1,4 @@
-"""
-The tables a solution is made of, with the Gaia catalogue's column names.
-"""
+"""The tables of a solution, with the Gaia catalogue's column names."""
 from dataclasses import replace
 
 import astropy.units as u
@@ -18,24 +16,26 @@ from photutils_mgauss._stacked import invert_2x2
 from photutils_mgauss._tangent_plane import directions
 from photutils_mgauss.alignment import judge
 
-# bit: (name, sentence)
+# What each bit of a star's flags means.
 FLAGS = {
-    1: ('no_solution', 'too few detections or too short a time for the '
+    1: ('no_solution: too few detections, or too short a time, for the '
         'parameters asked for; all are NaN'),
-    2: ('bad_error', 'a detection had an error that is not positive, or a '
+    2: ('bad_error: a detection had an error that is not positive, or a '
         'singular covariance; it has no weight'),
-    4: ('bad_position', 'a detection had a position that is not finite, or '
+    4: ('bad_position: a detection had a position that is not finite, or '
         'outside the bounding box of the WCS; it is left out'),
-    8: ('outlier', 'a detection was rejected as an outlier'),
-    16: ('ambiguous', 'another pairing of detections lay within the '
-         'tolerance of the match'),
-    32: ('reference_rejected', 'a reference object whose catalogue values '
-         'the data contradict; it was treated as any other star'),
-    64: ('held_out', 'a reference object kept back for validation'),
-    128: ('parallax_correlated', 'no parallax was fitted, and parallax '
-          'and motion would correlate by more than 0.3: a parallax biases '
-          'the motion'),
-    256: ('relative', 'motions are relative to the mean of the stars'),
+    8: 'outlier: a detection was rejected as an outlier',
+    16: ('ambiguous: another pairing of detections lay within the tolerance '
+         'of the match'),
+    32: ('reference_rejected: a reference object whose catalogue values the '
+         'data contradict; it was treated as any other star'),
+    64: 'held_out: a reference object kept back for validation',
+    128: ('parallax_correlated: no parallax was fitted, and parallax and '
+          'motion would correlate by more than 0.3: a parallax biases the '
+          'motion'),
+    256: 'relative: motions are relative to the mean of the stars',
+    512: ('inconsistent: the detections do not agree with one straight '
+          'motion; the star was not used to tie the frames'),
 }
 GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
 FROM_OURS = [0, 1, 4, 2, 3]  # position, parallax, motion
@@ -123,7 +123,7 @@ def star_table(fit, ref_year):
     table['flux'] = _mean_flux(sightings.flux)
     table['reference'] = _reference_kinds(fit)
     table['flags'] = flags
-    table.meta['ref_epoch_scale'] = 'tdb'
+    table.meta['TIMESYS'] = 'TDB'
     return table
 
 
@@ -190,6 +190,7 @@ def _flags(fit):
         16: sightings.matches.ambiguous,
         32: np.isin(stars, state.dropped),
         64: np.isin(stars, fit.scene.held),
+        512: state.untied,
         256: np.full(len(solved), relative),
     }
     return sum(bit * mark.astype(int) for bit, mark in marks.items()), solved
@@ -259,8 +260,8 @@ def alignment_table(fit):
     centre = np.array(transform.centre)[:, None]
     shift, slope, errors = [], [], []
     for e, coefficients in enumerate(state.maps):
-        shift.append(transform.apply(coefficients, centre)[:, 0]
-                     - centre[:, 0])
+        shift.append(_whole_shift(transform, coefficients, centre,
+                                  sightings.ties[e]))
         slope.append(_whole_slope(transform, coefficients, centre,
                                   sightings.ties[e]))
         errors.append(_shift_errors(fit, e))
@@ -273,9 +274,17 @@ def alignment_table(fit):
     table['coefficients'] = state.maps * unit
     _add_counts(table, fit, unit)
     table['systematic'] = np.sqrt(state.floor) * unit
-    table.meta.update(transform=transform.kind, degree=transform.degree,
-                      centre=list(transform.centre), scale=transform.scale)
+    table.meta.update(kind=transform.kind, degree=transform.degree,
+                      xcentre=transform.centre[0],
+                      ycentre=transform.centre[1], scale=transform.scale)
     return table
+
+
+def _whole_shift(transform, coefficients, centre, tie):
+    """Return the shift at the centre, or for a tied plane that of (0, 0)."""
+    if tie is not None:
+        return transform.apply(coefficients, tie[:, :1])[:, 0]
+    return (transform.apply(coefficients, centre) - centre)[:, 0]
 
 
 def _whole_slope(transform, coefficients, centre, tie):
@@ -284,7 +293,7 @@ def _whole_slope(transform, coefficients, centre, tie):
 
 
 def _shift_errors(fit, e):
-    """Standard errors of a map's shift at the centre of the field."""
+    """Return the errors of a map's shift at the centre of the field."""
     b = fit.scene.transform.n_terms
     covariance = fit.frames.covariance(e)
     return np.sqrt(np.diag(covariance)[[0, b]])

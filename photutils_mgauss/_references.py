@@ -228,8 +228,8 @@ def _known(catalogue, i, origin, year, unit, size):
         covariance[[2, 3, 4], [2, 3, 4]] = ZERO[unit]**2
     if catalogue.kinds[i] == 'position':
         value[2:] = np.nan
-    known = (np.isfinite(value) & (np.diag(covariance) < 1e-3 * UNKNOWN))[:size]
-    known = np.flatnonzero(known)
+    known = np.isfinite(value) & (np.diag(covariance) < 1e-3 * UNKNOWN)
+    known = np.flatnonzero(known[:size])
     return (matrix[known, :size], covariance[np.ix_(known, known)],
             value[known])
 

@@ -67,9 +67,7 @@ def pixel_to_vectors(wcs, x, y, *, bounded=True):
 
 
 def pixel_jacobian(wcs, plane, x, y):
-    """
-    Return d(plane)/d(pixel), shape (2, 2, n) [mas/pix], by differences.
-    """
+    """Return d(plane)/d(pixel), shape (2, 2, n) [mas/pix]."""
     columns = []
     for dx, dy in ((STEP, 0), (0, STEP)):
         after, before = (
@@ -119,8 +117,8 @@ def invert_wcs(wcs, coordinates, *, start=None, tolerance=1e-7,
     >>> wcs.wcs.crval = 0, 90
     >>> wcs.wcs.cdelt = -1e-4, 1e-4
     >>> x, y = invert_wcs(wcs, SkyCoord([0, 90], [90, 89.999], unit='deg'))
-    >>> abs(wcs.pixel_to_world(x, y).dec.deg - [90, 89.999]).max() < 1e-10
-    True
+    >>> wcs.pixel_to_world(x, y).dec.deg
+    array([90.   , 89.999])
     """
     check_celestial(wcs)
     target = np.asarray(coordinates.icrs.cartesian.xyz.value)
@@ -135,7 +133,9 @@ def invert_wcs(wcs, coordinates, *, start=None, tolerance=1e-7,
         step = np.hypot(dx, dy)
         if not (step > tolerance).any():
             break
-    found = step <= tolerance
+    here = pixel_to_vectors(wcs, x, y, bounded=False)
+    # Residuals vanish at the antipode as well.
+    found = (step <= tolerance) & (np.sum(here * target, axis=0) > 0)
     return (np.where(found, x, np.nan).reshape(shape),
             np.where(found, y, np.nan).reshape(shape))
 

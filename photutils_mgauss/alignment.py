@@ -13,6 +13,7 @@ from scipy import stats
 from photutils_mgauss._stacked import invert_2x2
 from photutils_mgauss._transforms import Transform, fit_map
 
+SIGNIFICANT = 2.0  # standard deviations that call for a floor
 NULL = 1e-10  # relative to the information before stars are eliminated
 
 
@@ -37,7 +38,8 @@ class Frames:
 
     def covariance(self, epoch):
         """Return the covariance (2 b, 2 b) of one map's coefficients."""
-        rows = self.factor.reshape(len(self.correction), -1,
+        n_epochs, _, b = self.correction.shape
+        rows = self.factor.reshape(n_epochs, 2 * b,
                                    self.factor.shape[1])[epoch]
         return rows @ rows.T
 
@@ -257,7 +259,7 @@ def worst_outliers(judgement, used, spare, clip):
 
 def floor_variance(residuals, covariance, expected, floor, *,
                    robust=False):
-    """
+    r"""
     Return the variance per axis that makes one epoch's chi-square expected.
 
     Parameters
@@ -275,7 +277,7 @@ def floor_variance(residuals, covariance, expected, floor, *,
 
     Notes
     -----
-    Solves :math:`\\sum r^T (\\Sigma + s I)^{-1} r = \\sum (2 - h)` for s by
+    Solves :math:`\sum r^T (\Sigma + s I)^{-1} r = \sum (2 - h)` for s by
     bisection in a safe bracket; 0 where the errors explain the residuals.
     """
     good = np.isfinite(residuals).all(axis=0) & np.isfinite(expected)
@@ -293,8 +295,12 @@ def floor_variance(residuals, covariance, expected, floor, *,
         if robust:
             return np.median(chi2 / expected) - np.log(2)
         return chi2.sum() - expected.sum()
+    # An excess that good errors alone would show every twentieth time is
+    # not worth a floor, which would only make all errors too large.
+    noise = (1 / np.sqrt(len(expected)) if robust
+             else np.sqrt(2 * expected.sum()))
     low, high = 0.0, max(floor, np.max(residuals**2), 1e-30)
-    if excess(0.0) <= 0:
+    if excess(0.0) <= SIGNIFICANT * noise:
         return 0.0
     for _ in range(60):
         middle = (low + high) / 2

@@ -4,7 +4,7 @@ Proper motions from tables of several epochs, and frames that fit together.
 Nie et al., Section 4.2 (``recipe='paper'``), and a joint solution of all
 stars and all frames with exact covariances (``recipe='joint'``).
 """
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import astropy.units as u
@@ -14,6 +14,7 @@ from astropy.table import QTable
 from photutils_mgauss._assemble import assemble, check_epochs, tie_planes
 from photutils_mgauss._epoch import Epoch
 from photutils_mgauss._fit_motions import Fit, Options, fit, prepare
+from photutils_mgauss._joint import Priors, solve_all
 from photutils_mgauss._motion_table import (
     FLAGS,
     alignment_table,
@@ -71,7 +72,7 @@ def decode_motion_flags(flags):
     >>> decode_motion_flags(8)
     ['outlier: a detection was rejected as an outlier']
     """
-    return [f'{name}: {sentence}' for bit, (name, sentence) in FLAGS.items()
+    return [sentence for bit, sentence in FLAGS.items()
             if int(flags) & bit]
 
 
@@ -121,6 +122,24 @@ class MotionSolution:
         chi-square (of two degrees of freedom, leverage taken into account).
         """
         return residual_table(self._fit)
+
+
+    def measured(self):
+        """
+        Return the stars as the detections alone have them.
+
+        The same table as ``stars``, in the same frames, but without what the
+        catalogue says of each reference object: for comparing the two.
+        """
+        result = self._fit
+        alone = replace(result.problem,
+                        priors=Priors.none(result.problem.n_parameters))
+        estimates = solve_all(alone, result.frames.correction,
+                              result.frames.factor,
+                              result.scene.options.executor, residuals=True)
+        year = float(self.stars['ref_epoch'][0].value)
+        return star_table(replace(result, problem=alone,
+                                  estimates=estimates), year)
 
 
 class ProperMotionFitter:
@@ -287,9 +306,14 @@ class ProperMotionFitter:
         held = as_real(self.hold_out, 'hold_out', minimum=0, maximum=0.9)
         prior = _check_quantity(self.parallax_prior, 'parallax_prior',
                                 u.mas).to_value(u.mas)
+        if self.executor is not None and not hasattr(self.executor, 'map'):
+            msg = ('executor must be a concurrent.futures.Executor, got '
+                   f'{self.executor!r:.80}')
+            raise TypeError(msg)
         return Options(Transform.parse(self.transform), self.recipe,
                        self.parallax, tuple(prior), bool(self.acceleration),
-                       _systematic(self.systematic, unit), clip, held,
+                       _systematic(self.systematic, unit), clip,
+                       self._match().tolerance(unit).max_motion, held,
                        self.rng, self.executor)
 
 
