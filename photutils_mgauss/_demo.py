@@ -14,6 +14,7 @@ from astropy.stats import mad_std
 from astropy.table import QTable
 from photutils.background import Background2D
 from photutils.detection import DAOStarFinder
+from scipy.spatial import cKDTree
 
 from photutils_mgauss.field import fit_mixture_field, select_psf_stars
 from photutils_mgauss.gridded import GriddedMixturePSF
@@ -72,20 +73,20 @@ class Measured:
     n_psf_stars: int
     catalogue: QTable
 
-    @property
-    def offsets(self):
-        """Position errors and pulls (n, 2) of stars beside the truth."""
+    def residuals(self):
+        """Return a row for each star: magnitude, error, stated error."""
         truth = self.scene.truth
         ours = np.column_stack([self.catalogue['x_fit'],
                                 self.catalogue['y_fit']])
         true = np.column_stack([truth['x'].value, truth['y'].value])
-        distance = np.hypot(*(ours[:, None] - true).transpose(2, 0, 1))
-        nearest = distance.argmin(axis=1)
-        near = (distance.min(axis=1) < 1) & (self.catalogue['flags'] == 0)
-        delta = (ours - true[nearest])[near]
-        errors = np.column_stack([self.catalogue['x_err'],
-                                  self.catalogue['y_err']])[near]
-        return delta, delta / errors
+        distance, nearest = cKDTree(true).query(ours)
+        near = distance < 1
+        return QTable({
+            'mag': truth['mag'][nearest][near],
+            'delta': (ours - true[nearest])[near] * u.pix,
+            'error': np.column_stack([self.catalogue['x_err'],
+                                      self.catalogue['y_err']])[near] * u.pix,
+        })
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,12 +188,14 @@ def summary(result):
     """Return the lines that say what was recovered."""
     lines = ['epoch       band  PSF stars  stars  position error [mas]  pull']
     for epoch in result.epochs:
-        delta, pull = epoch.offsets
+        stars = epoch.residuals()
         scale = 1000 * epoch.scene.instrument.pixel_scale
+        pull = (stars['delta'] / stars['error']).value
         lines.append(
             f'{epoch.scene.time.isot[:10]}  {epoch.scene.exposure.band.name}'
-            f'     {epoch.n_psf_stars:9d}  {len(delta):5d}'
-            f'  {scale * mad_std(delta):20.2f}  {mad_std(pull):4.2f}')
+            f'     {epoch.n_psf_stars:9d}  {len(stars):5d}'
+            f'  {scale * mad_std(stars["delta"].value):20.2f}'
+            f'  {mad_std(pull):4.2f}')
     lines.append('')
     lines.append('stars [mag]  number  median error  true scatter [mas/yr]'
                  '  pull')
@@ -213,3 +216,27 @@ def _motion_line(part, low, high):
                                       in ('pmra', 'pmdec')]))
     return (f'{low}-{high}        {len(part):6d}  {error:12.3f}'
             f'  {mad_std(delta):21.3f}  {mad_std(pull):4.2f}')
+
+
+def plot_positions(result, axes):
+    """Plot the position errors of the first and the last epoch."""
+    from photutils_mgauss.plotting import plot_error_curve
+    for ax, epoch in zip(axes, (result.epochs[0], result.epochs[-1]),
+                         strict=True):
+        stars = epoch.residuals()
+        scale = 1000 * epoch.scene.instrument.pixel_scale
+        plot_error_curve(ax, stars['mag'].value,
+                         scale * stars['delta'].value,
+                         scale * stars['error'].value, unit='mas')
+        ax.set_title(f'{epoch.scene.time.isot[:10]}, band '
+                     f'{epoch.scene.exposure.band.name}')
+
+
+def plot_motions(result, axes):
+    """Plot measured against true proper motions."""
+    from photutils_mgauss.plotting import plot_comparison
+    stars = result.matched
+    for ax, name in zip(axes, ('pmra', 'pmdec'), strict=True):
+        plot_comparison(ax, stars[f'{name}_true'].value, stars[name].value,
+                        stars[f'{name}_error'].value, label=name,
+                        unit='mas/yr')

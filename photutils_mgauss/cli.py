@@ -94,10 +94,10 @@ def _draw(result, folder):
     except ImportError:
         print('no figures: matplotlib is not installed')
         return []
-    from photutils_mgauss import plotting
+    from photutils_mgauss import _demo
     paths = []
-    for name, plot in (('positions', plotting.plot_position_errors),
-                       ('motions', plotting.plot_true_motions)):
+    for name, plot in (('positions', _demo.plot_positions),
+                       ('motions', _demo.plot_motions)):
         figure = Figure(figsize=(9, 4), layout='constrained')
         plot(result, figure.subplots(1, 2))
         paths.append(folder / f'{name}.png')
