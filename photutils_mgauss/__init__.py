@@ -25,6 +25,7 @@ _OWNERS = {
     'GriddedMixturePSF': 'gridded',
     'MixtureField': 'field',
     'fit_mixture_field': 'field',
+    'select_psf_stars': 'selection',
     'MultiGaussianPSFModel': 'model',
     'GaussianMixture': 'mixture',
     'blend': 'mixture',

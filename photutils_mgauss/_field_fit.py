@@ -14,10 +14,10 @@ whole problem is
 
 whose size does not depend on the number of stars.
 """
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
-from dataclasses import dataclass, replace
 import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -120,8 +120,7 @@ class Workers:
     def map(self, function, n_stars, *args):
         """Call function(*args of a part of the stars) for each part."""
         edges = np.linspace(0, n_stars, min(self.n, n_stars) + 1).astype(int)
-        parts = [slice(a, b) for a, b in zip(edges[:-1], edges[1:],
-                                             strict=True)]
+        parts = [slice(a, b) for a, b in pairwise(edges)]
         jobs = [self.executor.submit(function, *(a[part] for a in args))
                 for part in parts]
         return [job.result() for job in jobs]

@@ -13,7 +13,6 @@ from photutils_mgauss._field_fit import (
     Problem,
     model_stamps,
     optimise,
-    to_vector,
 )
 
 # Stars used while the degree is low: enough for its few coefficients.
@@ -146,7 +145,7 @@ def advance(state, workers, **options):
         state.problem, state.coefficients, state.prior, workers, **options)
 
 
-def weigh(state, *, reject):
+def weigh(state, *, reject, share=1.0):
     """
     Renew weights and rejections from the present model, in place.
 
@@ -165,7 +164,8 @@ def weigh(state, *, reject):
         light = np.maximum(model - problem.sky[:, None, None], 0)
     variance = stamps.base + stamps.slope * light
     if residual is not None:
-        state.accuracy = _accuracy(residual, light, variance, problem)
+        state.accuracy = share * _accuracy(residual, light, variance,
+                                           problem)
     variance = variance + (state.accuracy * light) ** 2
     if reject and residual is not None:
         _reject(state, residual, variance)
@@ -253,8 +253,8 @@ def _stage(state, index, degree, workers, reject):
                     state.prior.first(terms), None, state.accuracy,
                     np.zeros(few.stamps.good.shape, bool))
     _settle_all(part, workers)
-    for rounds in range(2):
-        weigh(part, reject=reject)
+    for _ in range(2):
+        weigh(part, reject=reject, share=0.5)
         advance(part, workers, tolerance=0.1, max_steps=10)
     state.coefficients, state.accuracy = part.coefficients, part.accuracy
 
@@ -270,8 +270,8 @@ def _finish(state, degree, workers, reject):
     terms = n_terms(degree)
     state.coefficients = _raised(state.coefficients, terms)
     _settle_all(state, workers)
-    for tolerance in (0.1, 0.01, 1e-3):
-        weigh(state, reject=reject)
+    for share, tolerance in ((0.3, 0.1), (0.3, 0.1), (0.5, 0.01), (1, 1e-3)):
+        weigh(state, reject=reject, share=share)
         advance(state, workers, tolerance=tolerance)
     return state
 

@@ -410,8 +410,8 @@ def render_grid(x, y, flux, left, bottom, nodes, x_grid, y_grid, integrated,
 #
 # shapes (K, 6) are the numbers that vary over the detector: log weight, x, y,
 # log_p, s, log_q with p = exp(2 log_p), q = exp(2 log_q), so that any values
-# are a valid mixture. The first three of the first Gaussian are never fitted: they would
-# repeat the flux and the position of the stars.
+# are a valid mixture. The first three of the first Gaussian are never fitted:
+# they would repeat the flux and the position of the stars.
 #
 # sources (M, 3) are x, y and flux of a star and of the neighbours in its
 # stamp, of which the first n_sources count. In the normal equations of one
@@ -596,7 +596,7 @@ def field_normal(stamps, weights, corners, basis, coefficients, sources,
     triangle, and gradient (P T,) order unknowns by shape, then term, with
     P = 6 K - 3. chi2 (n,).
     """
-    n_terms, k, _ = coefficients.shape
+    k = coefficients.shape[1]
     shapes = np.empty((k, 6))
     rows = np.empty((k, 6))
     row = np.empty(normal.shape[0])

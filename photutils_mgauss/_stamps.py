@@ -69,7 +69,9 @@ def cut_stamps(data, error, mask, x, y, radius):
         stamps[i][here] = data[there]
         good[i][here] = True if mask is None else ~mask[there]
         if error is not None:
-            variance[i][here] = np.square(error[there], dtype=float)
+            # The sign is kept: a negative error marks a bad pixel, too.
+            sigma = error[there].astype(float)
+            variance[i][here] = sigma * np.abs(sigma)
     good &= np.isfinite(stamps) & np.isfinite(variance) & (variance > 0)
     stamps[~good] = 0
     variance[~good] = 1

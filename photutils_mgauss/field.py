@@ -12,24 +12,28 @@ Every parameter of each Gaussian is a polynomial of detector position,
 and all stars are fitted together, each with its own position and flux. No
 pixel is resampled on the way, and the variance is that of the model.
 """
-from dataclasses import dataclass, field
 import warnings
+from dataclasses import dataclass, field
 
-from astropy.table import QTable, Table
-from astropy.utils.exceptions import AstropyUserWarning
 import numpy as np
+from astropy.table import QTable
+from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss import _field_stages as stages
-from photutils_mgauss._field_fit import Problem, Workers
+from photutils_mgauss._field_fit import (
+    Problem,
+    Workers,
+    model_stamps,
+    to_vector,
+)
 from photutils_mgauss._stamps import cut_stamps, remove_star_noise
+from photutils_mgauss._tables import as_image, read_sources
 from photutils_mgauss._validation import as_integer, as_real, as_shape
 from photutils_mgauss.gridded import GriddedMixturePSF
 from photutils_mgauss.mixture import GaussianMixture
 
 __all__ = ['MixtureField', 'fit_mixture_field']
 
-_X_NAMES = ('x', 'x_fit', 'x_init', 'x_centroid', 'xcentroid', 'x_0')
-_FLUX_NAMES = ('flux', 'flux_fit', 'flux_init', 'flux_0')
 # Neighbours may be this far off their catalogue positions [pix].
 _NEIGHBOUR_STDDEV = 0.5
 _MAX_NEIGHBOURS = 12
@@ -39,7 +43,7 @@ _STARS_PER_TERM = 2
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MixtureField:
-    """
+    r"""
     A mixture of Gaussians whose parameters are polynomials of position.
 
     Made by `fit_mixture_field`. The flux centroid of the mixture at every
@@ -52,9 +56,9 @@ class MixtureField:
         polynomials :math:`P_i(u) P_j(v)` ordered by i + j, then j. The six
         shapes of each Gaussian are its log weight (up to a common factor),
         its mean x and y up to a common shift [pix], and
-        :math:`\\tfrac12\\ln p, s, \\tfrac12\\ln q` with
-        :math:`q = 1/\\Sigma_{yy}`, :math:`s = \\Sigma_{xy} q`,
-        :math:`p = \\Sigma_{yy} / \\det\\Sigma`.
+        :math:`\tfrac12\ln p, s, \tfrac12\ln q` with
+        :math:`q = 1/\Sigma_{yy}`, :math:`s = \Sigma_{xy} q`,
+        :math:`p = \Sigma_{yy} / \det\Sigma`.
     shape : (int, int)
         The detector's shape (ny, nx); u and v run from -1 to 1 over it.
     radius : float
@@ -73,6 +77,8 @@ class MixtureField:
         at pixels that were not used.
     accuracy : float
         The relative error of the PSF that the stars' chi^2 asks for.
+    dropped : `~astropy.table.QTable`
+        ``id`` and ``reason`` of the stars that were not used.
     """
 
     coefficients: np.ndarray
@@ -82,6 +88,7 @@ class MixtureField:
     stars: QTable
     residual_stars: np.ndarray = field(default=None)
     accuracy: float = 0.0
+    dropped: QTable = field(default=None)
 
     def __repr__(self):
         used = int(np.count_nonzero(self.stars['used']))
@@ -291,7 +298,7 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=5,
     radius = as_real(radius, 'radius', minimum=2)
     strength = as_real(regularization, 'regularization', above=0)
     data, error, mask = _images(data, error, mask)
-    sources = _sources(stars)
+    sources = read_sources(stars)
     stamps, index, reasons = _usable_stamps(data, error, mask, sources,
                                             radius, effective_gain)
     degree = _possible_degree(degree, len(index))
@@ -302,62 +309,13 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=5,
     return _result(fit, sources, index, reasons, data.shape, radius)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sources:
-    """x, y, flux (NaN if unknown) of all sources, and which are stars."""
-
-    x: np.ndarray
-    y: np.ndarray
-    flux: np.ndarray
-    selected: np.ndarray
-
-
 def _images(data, error, mask):
-    data = _image(data, 'data')
+    data = as_image(data, 'data')
     if error is not None:
-        error = _image(error, 'error', data.shape)
+        error = as_image(error, 'error', data.shape)
     if mask is not None:
-        mask = _image(mask, 'mask', data.shape).astype(bool)
+        mask = as_image(mask, 'mask', data.shape).astype(bool)
     return data, error, mask
-
-
-def _image(value, name, shape=None):
-    """Return an image without copying it: it may be large."""
-    value = np.asanyarray(value)
-    if value.dtype.kind not in 'buif':
-        msg = f'{name} must be an array of numbers, got {value.dtype}'
-        raise TypeError(msg)
-    if value.ndim != 2 or (shape is not None and value.shape != shape):
-        want = '(ny, nx)' if shape is None else f'that of data, {shape}'
-        msg = f'{name} must have the shape {want}, got {value.shape}'
-        raise ValueError(msg)
-    return np.asarray(value)
-
-
-def _sources(stars):
-    if not isinstance(stars, Table):
-        msg = f'stars must be an astropy Table, got {type(stars).__name__}'
-        raise TypeError(msg)
-    name = next((n for n in _X_NAMES if n in stars.colnames), None)
-    if name is None:
-        msg = f'stars must have a column x, got {stars.colnames}'
-        raise ValueError(msg)
-    x, y = _column(stars, name), _column(stars, 'y' + name.removeprefix('x'))
-    flux = next((n for n in _FLUX_NAMES if n in stars.colnames), None)
-    flux = np.full(x.size, np.nan) if flux is None else _column(stars, flux)
-    selected = np.ones(x.size, bool)
-    if 'selected' in stars.colnames:
-        selected = np.asarray(stars['selected'], bool)
-    return _Sources(x, y, flux, selected)
-
-
-def _column(table, name):
-    if name not in table.colnames:
-        msg = f'stars must have a column {name}, got {table.colnames}'
-        raise ValueError(msg)
-    column = table[name]
-    column = getattr(column, 'value', column)
-    return np.ma.filled(np.ma.asarray(column, float), np.nan)
 
 
 def _usable_stamps(data, error, mask, sources, radius, gain):
@@ -451,14 +409,20 @@ def _with_neighbours(sources, index, stamps):
 
 def _result(fit, sources, index, reasons, shape, radius):
     matrix = fit.equations.matrix + np.diag(
-        stages.to_vector(fit.prior.precision))
+        to_vector(fit.prior.precision))
     covariance = np.linalg.inv(matrix)
-    residual = fit.problem.stamps.data - stages.model_stamps(
+    residual = fit.problem.stamps.data - model_stamps(
         fit.problem, fit.coefficients)
     residual[fit.problem.weights == 0] = np.nan
     return MixtureField(
         fit.coefficients, shape, radius, covariance,
-        _star_table(fit, sources, index, reasons), residual, fit.accuracy)
+        _star_table(fit, sources, index, reasons), residual, fit.accuracy,
+        _dropped(reasons))
+
+
+def _dropped(reasons):
+    rows = np.flatnonzero(reasons != '')
+    return QTable({'id': rows + 1, 'reason': reasons[rows]})
 
 
 def _star_table(fit, sources, index, reasons):
