@@ -54,12 +54,12 @@ def cut_stamps(data, error, mask, x, y, radius):
     """
     Cut stamps of n stars out of an image.
 
-    ``error`` may be None, for the scatter of the image's pixels. What it
-    says of the photons of the stars themselves is taken out of it, see
-    `poisson_slope`.
+    Without ``error`` the variance is 1.
     """
     half = int(np.ceil(radius))
-    corners = np.rint(np.column_stack([x, y])) - half
+    # A star without a position is far from the image, too.
+    positions = np.nan_to_num(np.column_stack([x, y]), nan=-1e6)
+    corners = np.rint(np.clip(positions, -1e6, 1e6)) - half
     size = 2 * half + 1
     shape = (len(corners), size, size)
     stamps, variance = np.zeros(shape), np.ones(shape)

@@ -1,7 +1,7 @@
 """Every star that cannot show the PSF is rejected, with its reason."""
-from astropy.table import Table
 import numpy as np
 import pytest
+from astropy.table import Table
 
 from photutils_mgauss import GaussianMixture, select_psf_stars
 
