@@ -23,6 +23,9 @@ except ImportError:  # a source tree that was never installed
 # Public name -> the module that owns it.
 _OWNERS = {
     'GriddedMixturePSF': 'gridded',
+    'MixtureField': 'field',
+    'fit_mixture_field': 'field',
+    'select_psf_stars': 'selection',
     'MultiGaussianPSFModel': 'model',
     'GaussianMixture': 'mixture',
     'blend': 'mixture',

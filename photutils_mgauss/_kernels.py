@@ -1769,6 +1769,118 @@ def _step_size(step, parameters, matrix, n):
         if step[a] != 0:
             noise = 0.1 / sqrt(matrix[a, a])
             size = max(size, abs(step[a]) / max(abs(parameters[a]), noise))
+# A field of mixtures fitted to the stamps of n stars.
+#
+# shapes (K, 6) are the numbers that vary over the detector: log weight, x, y,
+# log_p, s, log_q with p = exp(2 log_p), q = exp(2 log_q), so that any values
+# are a valid mixture. The first three of the first Gaussian are never fitted:
+# they would repeat the flux and the position of the stars.
+#
+# sources (M, 3) are x, y and flux of a star and of the neighbours in its
+# stamp, of which the first n_sources count. In the normal equations of one
+# stamp come first the Q numbers of its own, then the 6 K - 3 shapes, then the
+# residual, all in one triangle: eliminating the first Q is a Schur complement
+# that leaves the equations of the shapes, their right side and chi^2.
+
+_TWO_PI = 2 * np.pi
+
+
+@_jit
+def shape_rows(shapes, rows):
+    """Put the rows that other kernels take into rows (K, 6)."""
+    for k in range(shapes.shape[0]):
+        a, mx, my, log_p, s, log_q = shapes[k]
+        rows[k, 0] = exp(a + log_p + log_q) / _TWO_PI
+        rows[k, 1] = mx
+        rows[k, 2] = my
+        rows[k, 3] = exp(2 * log_p)
+        rows[k, 4] = s
+        rows[k, 5] = exp(2 * log_q)
+
+
+@_jit
+def _design(x, y, rows, sources, n_sources, first, row):
+    """
+    Put derivatives of a pixel into row and return the model.
+
+    Those by the shapes are added from index ``first`` on, unless it is
+    negative.
+    """
+    model = 0.0
+    for j in range(n_sources):
+        flux = sources[j, 2]
+        value = 0.0
+        gx = 0.0
+        gy = 0.0
+        for k in range(rows.shape[0]):
+            a, mx, my, p, s, q = rows[k]
+            dx = x - sources[j, 0] - mx
+            dy = y - sources[j, 1] - my
+            u = dx - s * dy
+            pu = p * u
+            qy = q * dy
+            exponent = pu * u + qy * dy
+            if not exponent < _LOG_NOTHING:
+                continue
+            g = a * exp(-0.5 * exponent)
+            by_x = pu * g
+            by_y = qy * g - s * by_x
+            value += g
+            gx += by_x
+            gy += by_y
+            if first >= 0:
+                _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy,
+                                       first + 6 * k - 3, k > 0, row)
+        row[3 * j] = flux * gx
+        row[3 * j + 1] = flux * gy
+        row[3 * j + 2] = value
+        model += flux * value
+    return model
+
+
+@_jit
+def _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy, at, moves,
+                           row):
+    fg = flux * g
+    if moves:
+        row[at] += fg
+        row[at + 1] += flux * by_x
+        row[at + 2] += flux * by_y
+    row[at + 3] += fg * (1 - pu * u)
+    row[at + 4] += fg * pu * dy
+    row[at + 5] += fg * (1 - qy * dy)
+
+
+@_jit
+def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
+                fit_sky, with_shapes, row, normal):
+    """
+    Sum the normal equations of a stamp into normal; return their size.
+
+    The size includes the column of the residual.
+    """
+    own = 3 * n_sources + fit_sky
+    size = own + 1
+    first = -1
+    if with_shapes:
+        size += 6 * rows.shape[0] - 3
+        first = own
+    normal[:size, :size] = 0.0
+    for j in range(stamp.shape[0]):
+        for i in range(stamp.shape[1]):
+            w = weight[j, i]
+            if w <= 0:
+                continue
+            row[:size] = 0.0
+            if fit_sky:
+                row[own - 1] = 1.0
+            model = _design(left + i, bottom + j, rows, sources, n_sources,
+                            first, row)
+            row[size - 1] = stamp[j, i] - sky - model
+            for m in range(size):
+                c = w * row[m]
+                for n in range(m, size):
+                    normal[m, n] += c * row[n]
     return size
 
 
@@ -1984,3 +2096,146 @@ def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
                 fitted_sky[i, 1] = sqrt(factor * sky_variance)
             outcome[i, 0] = status
             outcome[i, 1] = evaluations
+def _hold_neighbours(sources, anchors, n_sources, hold, size, normal):
+    """Add the prior of the neighbours: anchors with the precisions hold."""
+    for j in range(1, n_sources):
+        for i in range(3):
+            at = 3 * j + i
+            offset = anchors[j, i] - sources[j, i]
+            normal[at, at] += hold[j, i]
+            normal[at, size - 1] += hold[j, i] * offset
+            normal[size - 1, size - 1] += hold[j, i] * offset * offset
+
+
+@_jit
+def _eliminate(normal, n, size):
+    """Eliminate the first n unknowns from the upper triangle, in place."""
+    for k in range(n):
+        pivot = normal[k, k]
+        if not pivot > 0:
+            continue
+        for i in range(k + 1, size):
+            factor = normal[k, i] / pivot
+            if factor != 0:
+                for j in range(i, size):
+                    normal[i, j] -= factor * normal[k, j]
+
+
+@_jit
+def _back_substitute(normal, n, size, step):
+    """Solve for the first n unknowns after their elimination."""
+    for k in range(n - 1, -1, -1):
+        right = normal[k, size - 1]
+        for j in range(k + 1, n):
+            right -= normal[k, j] * step[j]
+        step[k] = right / normal[k, k] if normal[k, k] > 0 else 0.0
+
+
+@_jit
+def _settle(stamp, weight, left, bottom, rows, sources, anchors, hold,
+            n_sources, sky, fit_sky, n_steps, tolerance, row, normal, step):
+    """Fit the stamp's own numbers, its PSF given; return the sky."""
+    own = 3 * n_sources + fit_sky
+    for _ in range(n_steps):
+        size = _accumulate(stamp, weight, left, bottom, rows, sources,
+                           n_sources, sky, fit_sky, False, row, normal)
+        _hold_neighbours(sources, anchors, n_sources, hold, size, normal)
+        gain = normal[size - 1, size - 1]
+        _eliminate(normal, own, size)
+        gain -= normal[size - 1, size - 1]
+        _back_substitute(normal, own, size, step)
+        for j in range(n_sources):
+            for i in range(2):
+                # A longer step would leave the core, where linear is wrong.
+                sources[j, i] += min(max(step[3 * j + i], -0.5), 0.5)
+            sources[j, 2] += step[3 * j + 2]
+        if fit_sky:
+            sky += step[own - 1]
+        if not gain > tolerance:
+            break
+    return sky
+
+
+@_jit
+def field_normal(stamps, weights, corners, basis, coefficients, sources,
+                 anchors, hold, n_sources, sky, fit_sky, used, n_steps,
+                 tolerance, normal, total, gradient, chi2):
+    """
+    Settle n stars and add the equations of the used ones to total, gradient.
+
+    stamps, weights (n, s, s); corners (n, 2), the pixel (x, y) of each
+    stamp's first; basis (n, T); coefficients (T, K, 6); sources, anchors,
+    hold (n, M, 3); n_sources (n,); sky (n,) with fit_sky; used (n,). normal
+    is scratch (D, D) with D = 3 M + 6 K - 1. total (P T, P T), upper
+    triangle, and gradient (P T,) order unknowns by shape, then term, with
+    P = 6 K - 3. chi2 (n,).
+    """
+    k = coefficients.shape[1]
+    shapes = np.empty((k, 6))
+    rows = np.empty((k, 6))
+    row = np.empty(normal.shape[0])
+    step = np.empty(normal.shape[0])
+    spread = np.empty(gradient.size)
+    for star in range(stamps.shape[0]):
+        _shapes_at(basis[star], coefficients, shapes)
+        shape_rows(shapes, rows)
+        left, bottom = corners[star]
+        sky[star] = _settle(
+            stamps[star], weights[star], left, bottom, rows, sources[star],
+            anchors[star], hold[star], n_sources[star], sky[star], fit_sky,
+            n_steps, tolerance, row, normal, step)
+        size = _accumulate(
+            stamps[star], weights[star], left, bottom, rows, sources[star],
+            n_sources[star], sky[star], fit_sky, used[star], row, normal)
+        _hold_neighbours(sources[star], anchors[star], n_sources[star],
+                         hold[star], size, normal)
+        chi2[star] = normal[size - 1, size - 1]
+        if used[star]:
+            own = 3 * n_sources[star] + fit_sky
+            _eliminate(normal, own, size)
+            _spread(normal, own, size, basis[star], spread, total, gradient)
+
+
+@_jit
+def _shapes_at(basis, coefficients, shapes):
+    """Evaluate the polynomials, coefficients (T, K, 6), into (K, 6)."""
+    shapes[:] = 0.0
+    for t in range(basis.size):
+        if basis[t] != 0:
+            for k in range(shapes.shape[0]):
+                for i in range(6):
+                    shapes[k, i] += basis[t] * coefficients[t, k, i]
+
+
+@_jit
+def _spread(normal, own, size, basis, spread, total, gradient):
+    """Add A (x) B B^T to total, A being what is left of normal."""
+    n_terms = basis.size
+    for p in range(size - own - 1):
+        for q in range(p, size - own - 1):
+            for t in range(n_terms):
+                spread[q * n_terms + t] = normal[own + p, own + q] * basis[t]
+        right = normal[own + p, size - 1]
+        for t in range(n_terms):
+            b = basis[t]
+            if b != 0:
+                at = p * n_terms + t
+                gradient[at] += b * right
+                for j in range(p * n_terms, spread.size):
+                    total[at, j] += b * spread[j]
+
+
+@_jit
+def field_model(corners, basis, coefficients, sources, n_sources, sky, out):
+    """Put model stamps of n stars, neighbours and sky included, into out."""
+    k = coefficients.shape[1]
+    shapes = np.empty((k, 6))
+    rows = np.empty((k, 6))
+    for star in range(out.shape[0]):
+        _shapes_at(basis[star], coefficients, shapes)
+        shape_rows(shapes, rows)
+        left, bottom = corners[star]
+        out[star] = sky[star]
+        for j in range(n_sources[star]):
+            x, y, flux = sources[star, j]
+            render(rows, x - left, y - bottom, flux, False, out[star])
