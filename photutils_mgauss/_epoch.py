@@ -259,6 +259,13 @@ def plane_unit(epoch):
     return 'pix'
 
 
+def pixel_size(epoch):
+    """Return plane units in a pixel of an epoch without sky, or None."""
+    if epoch.pixel_scale is not None:
+        return _angle_per_pixel(epoch.pixel_scale)
+    return 1.0 if plane_unit(epoch) == 'pix' else None
+
+
 def sky_vectors(epoch):
     """Return ICRS unit vectors (3, n) of an epoch with sky positions."""
     if epoch.is_pixels:

@@ -252,7 +252,7 @@ def _reference_kinds(fit):
     return out
 
 
-def alignment_table(fit):
+def alignment_table(fit, wcs_residuals):
     """Return the `~astropy.table.QTable` of the epochs' maps."""
     scene, state = fit.scene, fit.state
     sightings, transform = scene.sightings, scene.transform
@@ -274,6 +274,7 @@ def alignment_table(fit):
     table['coefficients'] = state.maps * unit
     _add_counts(table, fit, unit)
     table['systematic'] = np.sqrt(state.floor) * unit
+    table['wcs_residual'] = np.array(wcs_residuals) * u.mas
     table.meta.update(kind=transform.kind, degree=transform.degree,
                       xcentre=transform.centre[0],
                       ycentre=transform.centre[1], scale=transform.scale)
@@ -359,7 +360,9 @@ def _leave_one_out(estimates, covariance, judgement):
     """Return residuals (2, E, n) from fits without the detection itself."""
     x, y = estimates.residuals
     left = invert_2x2(*(covariance - estimates.predicted))
-    a, b = left[0] * x + left[1] * y, left[1] * x + left[2] * y
     xx, xy, yy = covariance
-    out = np.stack([xx * a + xy * b, xy * a + yy * b])
+    # Infinite where a detection alone fixes its star: left out below.
+    with np.errstate(invalid='ignore'):
+        a, b = left[0] * x + left[1] * y, left[1] * x + left[2] * y
+        out = np.stack([xx * a + xy * b, xy * a + yy * b])
     return np.where(np.isfinite(judgement.chi2), out, np.nan)

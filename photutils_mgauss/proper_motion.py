@@ -12,6 +12,7 @@ import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss._assemble import assemble, check_epochs, tie_planes
+from photutils_mgauss._corrected_wcs import Correction, correct_epoch
 from photutils_mgauss._epoch import Epoch
 from photutils_mgauss._fit_motions import Fit, Options, fit, prepare
 from photutils_mgauss._joint import Priors, solve_all
@@ -21,7 +22,7 @@ from photutils_mgauss._motion_table import (
     residual_table,
     star_table,
 )
-from photutils_mgauss._parallax import julian_years
+from photutils_mgauss._parallax import julian_years, observer_velocity
 from photutils_mgauss._transforms import Transform
 from photutils_mgauss._validation import as_choice, as_real
 from photutils_mgauss.matching import Tolerance
@@ -283,8 +284,9 @@ class ProperMotionFitter:
         year = result.scene.working_year
         if self.ref_epoch is not None:
             year = float(julian_years(self.ref_epoch, 'ref_epoch'))
-        return MotionSolution(star_table(result, year), list(epochs),
-                              alignment_table(result),
+        corrected, residuals = _corrected(epochs, result)
+        return MotionSolution(star_table(result, year), corrected,
+                              alignment_table(result, residuals),
                               result.frames.undetermined, result)
 
     def _match(self):
@@ -315,6 +317,21 @@ class ProperMotionFitter:
                        _systematic(self.systematic, unit), clip,
                        self._match().tolerance(unit).max_motion, held,
                        self.rng, self.executor)
+
+
+def _corrected(epochs, result):
+    """Return the epochs with corrected WCS, and the residuals of those."""
+    scene = result.scene
+    plane = scene.sightings.plane
+    if plane is None or scene.transform.kind == 'none':
+        return list(epochs), [np.nan] * len(epochs)
+    pairs = [correct_epoch(
+        epoch, Correction(plane, scene.transform, coefficients,
+                          observer_velocity(epoch.observer)), tie)
+             for epoch, coefficients, tie in zip(
+                 epochs, result.state.maps, scene.sightings.ties,
+                 strict=True)]
+    return tuple(list(some) for some in zip(*pairs, strict=True))
 
 
 def _check_quantity(value, name, *units):
