@@ -552,12 +552,13 @@ def _add_thin(peak, cx, cy, p, s, q, reach, out):
 
 @_jit
 def render_image(x, y, flux, nodes, x_grid, y_grid, integrated, faintest,
-                 bottom, out):
+                 left, bottom, out):
     """
-    Add stars (n,) in the order given to out, detector rows bottom and up.
+    Add stars (n,) in the order given to out.
 
-    The order of the stars alone decides about rounding: a band of rows has
-    the pixels it would have in the whole image.
+    The first pixel of out is the detector's (left, bottom). The order of the
+    stars alone decides about rounding: a band of rows has the pixels it would
+    have in the whole image.
     """
     index = np.empty(4, np.int64)
     weights = np.empty((3, 4))
@@ -572,7 +573,7 @@ def render_image(x, y, flux, nodes, x_grid, y_grid, integrated, faintest,
                 a, mx, my, p, s, q = nodes[index[corner], k]
                 if a == 0:
                     continue
-                cx, cy = x[i] + mx, y[i] + my - bottom
+                cx, cy = x[i] + mx - left, y[i] + my - bottom
                 reach = 2 * log(max(abs(share * a) / faintest, 1 / _DEPTH))
                 if integrated:
                     _add_integrated(share * a, cx, cy, p, s, q, reach,
