@@ -413,35 +413,39 @@ def render_grid(x, y, flux, left, bottom, nodes, x_grid, y_grid, integrated,
 _DEPTH = 1e-3
 
 
-def _quadrature_tables(tolerance=1e-6, most=8):
+def _quadrature_tables(most=8):
     """
-    Return nodes and weights (most + 1, most) and the precisions they serve.
+    Return nodes and weights (most + 1, most) of 0 to 8 points, and errors.
 
-    The error of n points on a unit interval is bounded by
-    (n!)^4 (2n - 1)!! P^n / ((2n + 1) (2n)!^3) for a Gaussian of unit peak and
-    precision P; row n of the tables serves P up to ``limits[n]``.
+    On a unit interval n points miss a Gaussian of unit peak and precision P
+    by less than errors[n] P^n, (n!)^4 (2n - 1)!! / ((2n + 1) (2n)!^3).
     """
     nodes = np.zeros((most + 1, most))
     weights = np.zeros((most + 1, most))
-    limits = np.zeros(most + 1)
+    errors = np.zeros(most + 1)
     for n in range(1, most + 1):
         places, shares = np.polynomial.legendre.leggauss(n)
         nodes[n, :n], weights[n, :n] = places / 2, shares / 2
         twice = float(factorial(2 * n))
         odd = twice / (2**n * factorial(n))
-        bound = factorial(n)**4 * odd / ((2 * n + 1) * twice**3)
-        limits[n] = (tolerance / bound) ** (1 / n)
-    return nodes, weights, limits
+        errors[n] = factorial(n)**4 * odd / ((2 * n + 1) * twice**3)
+    return nodes, weights, errors
 
 
-_POINTS, _SHARES, _LIMITS = _quadrature_tables()
+_POINTS, _SHARES, _ERRORS = _quadrature_tables()
+
+# What integrating by points may miss, in units of the brightest Gaussian of
+# the star. The error is even about the star, so that it moves nothing.
+_QUADRATURE_ERROR = 1e-5
 
 
 @_jit
-def _quadrature_order(precision):
+def _quadrature_order(precision, tolerance):
     """Return the number of points that suffice, or 0 if none does."""
-    for n in range(1, _LIMITS.size):
-        if precision <= _LIMITS[n]:
+    power = 1.0
+    for n in range(1, _ERRORS.size):
+        power *= precision
+        if _ERRORS[n] * power <= tolerance:
             return n
     return 0
 
@@ -504,10 +508,10 @@ def _prepare_points(n, p, scratch):
 
 
 @_jit
-def _add_integrated(peak, cx, cy, p, s, q, reach, scratch, out):
+def _add_integrated(peak, cx, cy, p, s, q, reach, tolerance, scratch, out):
     """Add a Gaussian, integrated over each pixel, to out (ny, nx)."""
-    n_x = _quadrature_order(p)
-    n_y = _quadrature_order(q + s * s * p)
+    n_x = _quadrature_order(p, tolerance)
+    n_y = _quadrature_order(q + s * s * p, tolerance)
     if n_x * n_y == 0:
         _add_thin(peak, cx, cy, p, s, q, reach, out)
         return
@@ -552,30 +556,35 @@ def _add_thin(peak, cx, cy, p, s, q, reach, out):
 
 @_jit
 def render_image(x, y, flux, nodes, x_grid, y_grid, integrated, faintest,
-                 bottom, out):
+                 left, bottom, out):
     """
-    Add stars (n,) in the order given to out, detector rows bottom and up.
+    Add stars (n,) in the order given to out.
 
-    The order of the stars alone decides about rounding: a band of rows has
-    the pixels it would have in the whole image.
+    The first pixel of out is the detector's (left, bottom). The order of the
+    stars alone decides about rounding: a band of rows has the pixels it would
+    have in the whole image.
     """
     index = np.empty(4, np.int64)
     weights = np.empty((3, 4))
-    scratch = np.empty((3, _LIMITS.size))
+    scratch = np.empty((3, _ERRORS.size))
     for i in range(x.size):
         blend_weights(x[i], y[i], x_grid, y_grid, index, weights)
         for corner in range(4):
             share = weights[0, corner] * flux[i]
             if share == 0:
                 continue
+            highest = 0.0
+            for k in range(nodes.shape[1]):
+                highest = max(highest, abs(nodes[index[corner], k, 0]))
             for k in range(nodes.shape[1]):
                 a, mx, my, p, s, q = nodes[index[corner], k]
                 if a == 0:
                     continue
-                cx, cy = x[i] + mx, y[i] + my - bottom
+                cx, cy = x[i] + mx - left, y[i] + my - bottom
                 reach = 2 * log(max(abs(share * a) / faintest, 1 / _DEPTH))
                 if integrated:
                     _add_integrated(share * a, cx, cy, p, s, q, reach,
+                                    _QUADRATURE_ERROR * highest / abs(a),
                                     scratch, out)
                 else:
                     _add_sampled(share * a, cx, cy, p, s, q, reach, out)
