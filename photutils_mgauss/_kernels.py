@@ -631,35 +631,87 @@ def draw_unit(shapes, cx, cy, images):
 
 
 @_jit
-def _moments_of_product(a, b, weight, cx, cy, order, out):
-    """Put sum_pixels w a b x^n y^m into out[n, m], n + m <= order <= 4."""
-    out[:order + 1, :order + 1] = 0.0
-    for i in range(a.shape[1]):
-        s0, s1, s2, s3, s4 = 0.0, 0.0, 0.0, 0.0, 0.0
-        for j in range(a.shape[0]):
+def _columns_of_product(a, b, weight, cy, columns):
+    """
+    Put sum_y w a b y^m into columns[m, x], m <= 4.
+
+    Four columns at a time with sums of their own: the compiler packs them
+    into vectors, which it must not do to a single sum.
+    """
+    ny, nx = a.shape
+    blocks = nx - nx % 4
+    for i in range(0, blocks, 4):
+        p0, p1, p2, p3 = 0.0, 0.0, 0.0, 0.0
+        q0, q1, q2, q3 = 0.0, 0.0, 0.0, 0.0
+        r0, r1, r2, r3 = 0.0, 0.0, 0.0, 0.0
+        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+        t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
+        for j in range(ny):
+            v = j - cy
+            h0 = weight[j, i] * a[j, i] * b[j, i]
+            h1 = weight[j, i + 1] * a[j, i + 1] * b[j, i + 1]
+            h2 = weight[j, i + 2] * a[j, i + 2] * b[j, i + 2]
+            h3 = weight[j, i + 3] * a[j, i + 3] * b[j, i + 3]
+            p0, p1, p2, p3 = p0 + h0, p1 + h1, p2 + h2, p3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            q0, q1, q2, q3 = q0 + h0, q1 + h1, q2 + h2, q3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            r0, r1, r2, r3 = r0 + h0, r1 + h1, r2 + h2, r3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            s0, s1, s2, s3 = s0 + h0, s1 + h1, s2 + h2, s3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            t0, t1, t2, t3 = t0 + h0, t1 + h1, t2 + h2, t3 + h3
+        _put(columns[0], i, p0, p1, p2, p3)
+        _put(columns[1], i, q0, q1, q2, q3)
+        _put(columns[2], i, r0, r1, r2, r3)
+        _put(columns[3], i, s0, s1, s2, s3)
+        _put(columns[4], i, t0, t1, t2, t3)
+    for i in range(blocks, nx):
+        p, q, r, s, t = 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(ny):
             v = j - cy
             h = weight[j, i] * a[j, i] * b[j, i]
-            hv = h * v
-            hvv = hv * v
-            s0 += h
-            s1 += hv
-            s2 += hvv
-            if order > 2:
-                s3 += hvv * v
-                s4 += hvv * v * v
+            p += h
+            q += h * v
+            r += h * v * v
+            s += h * v * v * v
+            t += h * v * v * v * v
+        columns[0, i], columns[1, i], columns[2, i] = p, q, r
+        columns[3, i], columns[4, i] = s, t
+
+
+@_jit
+def _put(row, i, a, b, c, d):
+    row[i], row[i + 1], row[i + 2], row[i + 3] = a, b, c, d
+
+
+@_jit
+def _moments_of_product(a, b, weight, cx, cy, columns, out):
+    """
+    Put sum_pixels w a b x^n y^m into out[n, m], n + m <= 4.
+
+    columns (5, nx) is scratch.
+    """
+    _columns_of_product(a, b, weight, cy, columns)
+    a0, a1, a2, a3, a4 = 0.0, 0.0, 0.0, 0.0, 0.0
+    b0, b1, b2, b3 = 0.0, 0.0, 0.0, 0.0
+    c0, c1, c2 = 0.0, 0.0, 0.0
+    d0, d1, e0 = 0.0, 0.0, 0.0
+    for i in range(columns.shape[1]):
         x = i - cx
-        power = 1.0
-        for n in range(order + 1):
-            out[n, 0] += power * s0
-            if n + 1 <= order:
-                out[n, 1] += power * s1
-            if n + 2 <= order:
-                out[n, 2] += power * s2
-            if n + 3 <= order:
-                out[n, 3] += power * s3
-            if n + 4 <= order:
-                out[n, 4] += power * s4
-            power *= x
+        xx = x * x
+        s0, s1, s2 = columns[0, i], columns[1, i], columns[2, i]
+        a0, a1, a2 = a0 + s0, a1 + s1, a2 + s2
+        a3, a4 = a3 + columns[3, i], a4 + columns[4, i]
+        b0, b1 = b0 + x * s0, b1 + x * s1
+        b2, b3 = b2 + x * s2, b3 + x * columns[3, i]
+        c0, c1, c2 = c0 + xx * s0, c1 + xx * s1, c2 + xx * s2
+        d0, d1 = d0 + xx * x * s0, d1 + xx * x * s1
+        e0 += xx * xx * s0
+    out[0, 0], out[0, 1], out[0, 2], out[0, 3], out[0, 4] = a0, a1, a2, a3, a4
+    out[1, 0], out[1, 1], out[1, 2], out[1, 3] = b0, b1, b2, b3
+    out[2, 0], out[2, 1], out[2, 2] = c0, c1, c2
+    out[3, 0], out[3, 1], out[4, 0] = d0, d1, e0
 
 
 @_jit
@@ -698,30 +750,31 @@ def _polynomials(shape, out):
     out[5, 5] = -m * m
 
 
+# The powers of x and y in the monomials 1, x, y, xx, xy, yy.
+_POWER_X = np.array([0, 1, 0, 2, 1, 0])
+_POWER_Y = np.array([0, 0, 1, 0, 1, 2])
+
+
 @_jit
 def _contract(left, moments, right, half, out):
     """
     Put the moments of a product, seen by its parameters, into out (6, 6).
 
-    left and right (6, 6) are the polynomials of the two Gaussians; half (6,)
-    is scratch.
+    left and right (6, 6) are the polynomials of the two Gaussians; half
+    (6, 6) is scratch.
     """
-    for i in range(6):
+    half[:] = 0.0
+    for a in range(6):
         for c in range(6):
-            total = 0.0
-            for a in range(6):
-                total += left[i, a] * moments[_POWER_X[a] + _POWER_X[c],
-                                              _POWER_Y[a] + _POWER_Y[c]]
-            half[c] = total
-        for j in range(6):
-            total = 0.0
-            for c in range(6):
-                total += half[c] * right[j, c]
-            out[i, j] = total
-
-
-_POWER_X = np.array([0, 1, 0, 2, 1, 0])
-_POWER_Y = np.array([0, 0, 1, 0, 1, 2])
+            moment = moments[_POWER_X[a] + _POWER_X[c],
+                             _POWER_Y[a] + _POWER_Y[c]]
+            for j in range(6):
+                half[a, j] += moment * right[j, c]
+    out[:] = 0.0
+    for i in range(6):
+        for a in range(6):
+            for j in range(6):
+                out[i, j] += left[i, a] * half[a, j]
 
 
 @_jit
@@ -890,17 +943,15 @@ def penalty(shape, limits, matrix, gradient):
 
 
 @_jit
-def _residual(stamp, weight, images, fluxes, out):
-    """Put stamp minus model into out (ny, nx); return its chi square."""
-    chi2 = 0.0
+def _residual(stamp, images, fluxes, out):
+    """Put stamp minus model into out (ny, nx)."""
     for j in range(stamp.shape[0]):
         for i in range(stamp.shape[1]):
-            r = stamp[j, i]
-            for k in range(fluxes.size):
-                r -= fluxes[k] * images[k, j, i]
-            out[j, i] = r
-            chi2 += weight[j, i] * r * r
-    return chi2
+            out[j, i] = stamp[j, i]
+    for k in range(fluxes.size):
+        for j in range(stamp.shape[0]):
+            for i in range(stamp.shape[1]):
+                out[j, i] -= fluxes[k] * images[k, j, i]
 
 
 @_jit
@@ -921,18 +972,26 @@ def project(stamp, weight, centre, shapes, tie, signed, fluxes, scratch):
             dot = _weighted_dot(images[k], images[other], weight) + tie_weight
             gram[k, other] = gram[other, k] = dot
     _solve_fluxes(gram, rhs, signed, fluxes, active, work)
-    chi2 = _residual(stamp, weight, images, fluxes, residual)
+    _residual(stamp, images, fluxes, residual)
+    chi2 = _weighted_dot(residual, residual, weight)
     lack = fluxes.sum() - total
     return chi2 + tie_weight * lack * lack
 
 
 @_jit
 def _weighted_dot(a, b, weight):
-    total = 0.0
+    """Return sum_pixels w a b, in four sums that make a vector."""
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    blocks = a.shape[1] - a.shape[1] % 4
     for j in range(a.shape[0]):
-        for i in range(a.shape[1]):
-            total += weight[j, i] * a[j, i] * b[j, i]
-    return total
+        for i in range(0, blocks, 4):
+            s0 += weight[j, i] * a[j, i] * b[j, i]
+            s1 += weight[j, i + 1] * a[j, i + 1] * b[j, i + 1]
+            s2 += weight[j, i + 2] * a[j, i + 2] * b[j, i + 2]
+            s3 += weight[j, i + 3] * a[j, i + 3] * b[j, i + 3]
+        for i in range(blocks, a.shape[1]):
+            s0 += weight[j, i] * a[j, i] * b[j, i]
+    return s0 + s1 + s2 + s3
 
 
 @_jit
@@ -945,12 +1004,12 @@ def normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
     The images and the residual come from `project`.
     """
     images, residual = scratch[:2]
-    polynomials, moments, half, block = scratch[6:]
+    polynomials, columns, moments, half, block = scratch[6:]
     n = fluxes.size
     for k in range(n):
         _polynomials(shapes[k], polynomials[k])
         _moments_of_product(images[k], residual, weight, centre[0], centre[1],
-                            2, moments)
+                            columns, moments)
         for i in range(6):
             slope = 0.0
             for a in range(6):
@@ -960,7 +1019,7 @@ def normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
     for k in range(n):
         for other in range(k + 1):
             _moments_of_product(images[k], images[other], weight, centre[0],
-                                centre[1], 4, moments)
+                                centre[1], columns, moments)
             _contract(polynomials[k], moments, polynomials[other], half,
                       block)
             _place(block, k, other, fluxes, matrix)
