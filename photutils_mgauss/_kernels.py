@@ -438,22 +438,39 @@ _LANES = 32
 
 
 @_jit
-def _walk_starts(a, dx, dy, p, s, q, w, wy, height, walk):
+def paces(nodes, out):
+    """
+    Put the constant factors of walks over Gaussians into out (M, K, 4).
+
+    The precision along y at fixed x; how the quotient of columns grows from
+    row to row; how the quotients of rows, and of columns, fall.
+    """
+    for m in range(nodes.shape[0]):
+        for k in range(nodes.shape[1]):
+            _, _, _, p, s, q = nodes[m, k]
+            t = q + s * s * p
+            out[m, k, 0] = t
+            out[m, k, 1] = exp(p * s)
+            out[m, k, 2] = exp(-t)
+            out[m, k, 3] = exp(-p)
+
+
+@_jit
+def _walk_starts(a, dx, dy, p, s, q, pace, w, wy, height, walk):
     """
     Put what a walk along the columns starts from into walk (4, _LANES) flat.
 
     For each row the Gaussian in the first column, its quotient with the next
     one, p u, and the factor of the Gaussian in its derivative by y. Returns
     whether anything is there. The values of the first column are a Gaussian
-    in y, walked outward from its peak.
+    in y, walked outward from its peak. pace is as of `paces`.
     """
-    t = q + s * s * p
+    t, grow, drop, _ = pace
     u = dx
     slope = q * dy - p * s * u
     top = min(max(int(np.rint(-slope / t)), 0), height - 1)
     u -= s * top
     slope += t * top
-    drop = exp(-t)
     first = a * exp(-0.5 * (p * u * u + q * (dy + top) ** 2))
     if abs(first) < _NOTHING:
         return False
@@ -470,7 +487,6 @@ def _walk_starts(a, dx, dy, p, s, q, w, wy, height, walk):
         r *= drop
         walk[j] = g
     r = exp(-p * (dx + 0.5))
-    grow = exp(p * s)
     for j in range(height):
         walk[_LANES + j] = r
         r *= grow
@@ -481,23 +497,21 @@ def _walk_starts(a, dx, dy, p, s, q, w, wy, height, walk):
 
 
 @_jit
-def _add_walk(p, s, w, wx, height, width, walk, tile):
+def _add_walk(p, s, fall, w, wx, height, width, walk, tile):
     """Add a Gaussian to a tile, two multiplications a pixel."""
-    fall = exp(-p)
     for i in range(width):
         column = 3 * _LANES * i
+        pi = p * i
         for j in range(height):
             g = walk[j]
             r = walk[_LANES + j]
-            pu = walk[2 * _LANES + j]
-            h = pu * g
+            h = (walk[2 * _LANES + j] + pi) * g
             tile[column + j] += w * g
             tile[column + _LANES + j] += w * h + wx * g
             tile[column + 2 * _LANES + j] += (
                 walk[3 * _LANES + j] * g - w * s * h)
             walk[j] = g * r
             walk[_LANES + j] = r * fall
-            walk[2 * _LANES + j] = pu + p
 
 
 @_jit
@@ -522,8 +536,8 @@ def _add_points(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
 
 
 @_jit
-def _add_gaussian(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
-                  walk, tile):
+def _add_gaussian(a, dx, dy, p, s, q, pace, w, wx, wy, integrated, height,
+                  width, walk, tile):
     """
     Add a Gaussian, its first pixel at (dx, dy) from the peak, to a tile.
 
@@ -536,8 +550,8 @@ def _add_gaussian(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
     if integrated or steep:
         _add_points(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
                     tile)
-    elif _walk_starts(a, dx - s * dy, dy, p, s, q, w, wy, height, walk):
-        _add_walk(p, s, w, wx, height, width, walk, tile)
+    elif _walk_starts(a, dx - s * dy, dy, p, s, q, pace, w, wy, height, walk):
+        _add_walk(p, s, pace[3], w, wx, height, width, walk, tile)
 
 
 @_jit
@@ -546,10 +560,10 @@ def _fill_jet(x_0, y_0, box, psf, tiling, jet):
     Put the unit-flux PSF in a box and its derivatives by x_0 and y_0.
 
     They go into jet (3, width * height), column after column. psf is (nodes,
-    x_grid, y_grid, integrated), tiling is scratch (walk, tile, index,
+    paces, x_grid, y_grid, integrated), tiling is scratch (walk, tile, index,
     weights). The change of the blend with position is included.
     """
-    nodes, x_grid, y_grid, integrated = psf
+    nodes, paces, x_grid, y_grid, integrated = psf
     walk, tile, index, weights = tiling
     blend_weights(x_0, y_0, x_grid, y_grid, index, weights)
     row, column, height, width = box
@@ -565,7 +579,8 @@ def _fill_jet(x_0, y_0, box, psf, tiling, jet):
                 a, mx, my, p, s, q = nodes[index[corner], k]
                 if a != 0:
                     _add_gaussian(a, column - x_0 - mx,
-                                  row + bottom - y_0 - my, p, s, q, w, wx, wy,
+                                  row + bottom - y_0 - my, p, s, q,
+                                  paces[index[corner], k], w, wx, wy,
                                   integrated, rows, width, walk, tile)
         for part in range(3):
             for i in range(width):
@@ -969,8 +984,8 @@ def _measure_fit(x_init, y_init, boxes, weights, residuals, n, out):
             if weights[s, i] > 0:
                 total += abs(residuals[s, i])
                 squares += weights[s, i] * residuals[s, i] ** 2
-        x = int(ceil(x_init[s] - 0.5)) - column
-        y = int(ceil(y_init[s] - 0.5)) - row
+        x = ceil(x_init[s] - 0.5) - column
+        y = ceil(y_init[s] - 0.5) - row
         centre = np.nan
         if 0 <= x < width and 0 <= y < height and weights[
                 s, x * height + y] > 0:
@@ -981,26 +996,59 @@ def _measure_fit(x_init, y_init, boxes, weights, residuals, n, out):
 
 
 @_jit
+def _load_group(image, error, mask, stars, fixed, parameters, limits, data,
+                variance):
+    """
+    Fetch the pixels, initial values and limits of one group.
+
+    stars is (boxes, initial, sky, lower, upper). Returns the number of
+    pixels, or -1 if an error is not positive and finite.
+    """
+    boxes, initial, sky, lower, upper = stars
+    n = boxes.shape[0]
+    n_pixels = 0
+    for s in range(n):
+        got = _gather(image, error, mask, boxes[s], sky[s], data[s],
+                      variance[s])
+        if got < 0:
+            return -1
+        n_pixels += got
+        for b in range(3):
+            a = 3 * s + b
+            limits[0][a], limits[1][a] = lower[s, b], upper[s, b]
+            limits[2][a] = fixed[b]
+            parameters[a] = min(max(initial[s, b], lower[s, b]), upper[s, b])
+    parameters[3 * n] = 0.0
+    limits[0][3 * n], limits[1][3 * n] = -np.inf, np.inf
+    limits[2][3 * n] = False
+    return n_pixels
+
+
+@_jit
+def _scatter(sums, n_pixels, n_free):
+    """Return the variance of residuals, NaN without degrees of freedom."""
+    return sums[:, 2].sum() / (n_pixels - n_free) if (
+        n_pixels > n_free) else np.nan
+
+
+@_jit
 def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
-              fixed, fit_sky, gain, nodes, x_grid, y_grid, integrated,
-              max_iterations, fitted, fitted_sky, covariances, sums, outcome):
+              fixed, fit_sky, gain, psf, max_iterations, fitted, fitted_sky,
+              covariances, sums, outcome):
     """
     Fit flux, x and y of groups of stars.
 
     The stars of group g are starts[g] to starts[g + 1]. initial, lower and
     upper are (n, 3); fixed (3,) holds for all; sky (n,) is subtracted before
-    the fit, and fit_sky adds one level for each group. Results: fitted
-    (n, 3), fitted_sky (n, 2) with its error, covariances (n, 3, 3), sums
-    (n, 3) as of _measure_fit, outcome (n, 2) with the number of evaluations.
+    the fit, and fit_sky adds one level for each group. error and mask may be
+    empty; without errors the scatter of the residuals stands for them.
+    Results: fitted (n, 3), fitted_sky (n, 2) with its error, covariances
+    (n, 3, 3), sums (n, 3) as of _measure_fit, outcome (n, 2) with the number
+    of evaluations.
     """
-    most = 1
-    area = 1
-    for g in range(starts.size - 1):
-        most = max(most, starts[g + 1] - starts[g])
-    for i in range(boxes.shape[0]):
-        area = max(area, boxes[i, 2] * boxes[i, 3])
+    most = np.max(np.diff(starts)) if starts.size > 1 else 1
+    area = np.max(boxes[:, 2] * boxes[:, 3]) if boxes.size else 1
     size = 3 * most + 1
-    psf = (nodes, x_grid, y_grid, integrated)
     data, variance = np.empty((most, area)), np.empty((most, area))
     old = (np.zeros((most, area)), np.empty((most, area)),
            np.empty((size, size)), np.empty(size))
@@ -1012,62 +1060,36 @@ def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
     work = (np.empty(size), np.empty(size), np.empty(size, np.bool_),
             np.empty(size), np.empty((size, size)))
     limits = (np.empty(size), np.empty(size), np.empty(size, np.bool_))
-    parameters = np.empty(size)
-    chi2 = np.empty(2)
+    parameters, chi2 = np.empty(size), np.empty(2)
     for g in range(starts.size - 1):
-        first, n = starts[g], starts[g + 1] - starts[g]
-        stars = slice(first, first + n)
-        n_pixels = 0
-        longest = 1.0
-        for s in range(n):
-            i = first + s
-            got = _gather(image, error, mask, boxes[i], sky[i], data[s],
-                          variance[s])
-            if got < 0:
-                outcome[i, 0] = _BAD_ERROR
-                n_pixels = -1
-                break
-            n_pixels += got
-            longest = max(longest, 0.25 * max(boxes[i, 2], boxes[i, 3]))
-            for b in range(3):
-                a = 3 * s + b
-                limits[0][a], limits[1][a] = lower[i, b], upper[i, b]
-                limits[2][a] = fixed[b]
-                parameters[a] = min(max(initial[i, b], lower[i, b]),
-                                    upper[i, b])
+        n = starts[g + 1] - starts[g]
+        stars = slice(starts[g], starts[g + 1])
+        n_pixels = _load_group(
+            image, error, mask, (boxes[stars], initial[stars], sky[stars],
+                                 lower[stars], upper[stars]),
+            fixed, parameters, limits, data, variance)
         if n_pixels < 0:
+            outcome[stars, 0] = _BAD_ERROR
             continue
-        last = 3 * n
-        parameters[last] = 0.0
-        limits[0][last], limits[1][last] = -np.inf, np.inf
-        limits[2][last] = False
+        longest = max(1.0, 0.25 * np.max(boxes[stars, 2:]))
         pixels = (boxes[stars], data, variance, gain)
         status, evaluations = _minimize(
             parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
             limits, max_iterations, longest, chi2)
-        sky_variance = _covariances(old[2], limits[2], n, last + fit_sky,
+        sky_variance = _covariances(old[2], limits[2], n, 3 * n + fit_sky,
                                     work, covariances[stars])
         _measure_fit(initial[stars, 1], initial[stars, 2], boxes[stars],
                      old[0], old[1], n, sums[stars])
         factor = 1.0
         if error.size == 0 and gain == 0:
-            # Without errors the scatter of the residuals stands for them.
-            squares = 0.0
-            for s in range(n):
-                squares += sums[first + s, 2]
-            n_free = fit_sky
-            for b in range(3):
-                n_free += n * (not fixed[b])
-            factor = (squares / (n_pixels - n_free) if n_pixels > n_free
-                      else np.nan)
+            factor = _scatter(sums[stars], n_pixels,
+                              n * np.sum(~fixed) + fit_sky)
+        covariances[stars] *= factor
         for s in range(n):
-            i = first + s
             for b in range(3):
-                fitted[i, b] = parameters[3 * s + b]
-                for c in range(3):
-                    covariances[i, b, c] *= factor
-            if fit_sky:
-                fitted_sky[i, 0] = parameters[last]
-                fitted_sky[i, 1] = sqrt(factor * sky_variance)
-            outcome[i, 0] = status
-            outcome[i, 1] = evaluations
+                fitted[starts[g] + s, b] = parameters[3 * s + b]
+        if fit_sky:
+            fitted_sky[stars, 0] = parameters[3 * n]
+            fitted_sky[stars, 1] = sqrt(factor * sky_variance)
+        outcome[stars, 0] = status
+        outcome[stars, 1] = evaluations
