@@ -88,8 +88,8 @@ class PSFModel(Fittable2DModel):
         state['_mconstraints'] = {key: list(value) for key, value
                                   in state['_mconstraints'].items()}
         state['_constraints_cache'] = {}
-        if 'meta' in state:
-            state['meta'] = copy.copy(state['meta'])
+        if '_meta' in state:
+            state['_meta'] = copy.copy(state['_meta'])
         new.__dict__.update(state)
         return new
 
@@ -100,8 +100,8 @@ class PSFModel(Fittable2DModel):
         # What is shared is never changed in place, so it stays shared.
         new = self.copy()
         memo[id(self)] = new
-        if 'meta' in new.__dict__:
-            new.__dict__['meta'] = copy.deepcopy(self.meta, memo)
+        if '_meta' in new.__dict__:
+            new.__dict__['_meta'] = copy.deepcopy(self.meta, memo)
         return new
 
     def deepcopy(self):
