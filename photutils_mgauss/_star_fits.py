@@ -51,11 +51,16 @@ class Image:
     @classmethod
     def from_arrays(cls, data, error=None, mask=None, gain=None):
         """Convert to native float64; what is not finite is masked."""
-        data = np.ascontiguousarray(data, dtype=np.float64)
-        mask = _full_mask(data, mask)
-        error = (np.empty((0, 0)) if error is None
-                 else np.ascontiguousarray(error, dtype=np.float64))
+        data = _as_kernels_take(data, np.float64)
+        mask = _as_kernels_take(_full_mask(data, mask), np.bool_)
+        error = _as_kernels_take(
+            np.empty((0, 0)) if error is None else error, np.float64)
         return cls(data, error, mask, 0.0 if gain is None else float(gain))
+
+
+def _as_kernels_take(array, dtype):
+    """Return the array in the one form for which kernels are compiled."""
+    return np.require(array, dtype, ['C', 'A', 'W'])
 
 
 def _full_mask(data, mask):
@@ -81,8 +86,10 @@ def psf_arrays(model):
         grid = model._grid
         rows, x_grid, y_grid = grid.rows, grid.x_grid, grid.y_grid
     else:
-        rows = np.ascontiguousarray(model.mixture.rows[None])
+        rows = model.mixture.rows[None]
         x_grid = y_grid = np.zeros(1)
+    rows, x_grid, y_grid = (_as_kernels_take(a, np.float64)
+                            for a in (rows, x_grid, y_grid))
     paces = np.empty((*rows.shape[:2], 4))
     _kernels.paces(rows, paces)
     return rows, paces, x_grid, y_grid, model.pixel_integrated
