@@ -23,6 +23,9 @@ except ImportError:  # a source tree that was never installed
 # Public name -> the module that owns it.
 _OWNERS = {
     'GriddedMixturePSF': 'gridded',
+    'MixtureField': 'field',
+    'fit_mixture_field': 'field',
+    'select_psf_stars': 'selection',
     'MultiGaussianPSFModel': 'model',
     'GaussianMixture': 'mixture',
     'blend': 'mixture',
@@ -32,11 +35,13 @@ _OWNERS = {
     'Exposure': 'simulation',
     'Instrument': 'simulation',
     'Scene': 'simulation',
+    'SimulatedCatalogue': 'simulation',
     'crowded_field': 'simulation',
     'csst_psf': 'simulation',
     'paper_exposures': 'simulation',
     'render_stars': 'simulation',
     'simulate': 'simulation',
+    'simulate_catalogues': 'simulation',
     'simulate_epochs': 'simulation',
     'sky_field': 'simulation',
     'sparse_field': 'simulation',

@@ -5,6 +5,7 @@ Flux, x and y of every star, alone or jointly with the others of its group,
 by Levenberg-Marquardt in compiled code; what photutils adds around that
 (tables, units, flags) is not here.
 """
+import itertools
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -50,11 +51,16 @@ class Image:
     @classmethod
     def from_arrays(cls, data, error=None, mask=None, gain=None):
         """Convert to native float64; what is not finite is masked."""
-        data = np.ascontiguousarray(data, dtype=np.float64)
-        mask = _full_mask(data, mask)
-        error = (np.empty((0, 0)) if error is None
-                 else np.ascontiguousarray(error, dtype=np.float64))
+        data = _as_kernels_take(data, np.float64)
+        mask = _as_kernels_take(_full_mask(data, mask), np.bool_)
+        error = _as_kernels_take(
+            np.empty((0, 0)) if error is None else error, np.float64)
         return cls(data, error, mask, 0.0 if gain is None else float(gain))
+
+
+def _as_kernels_take(array, dtype):
+    """Return the array in the one form for which kernels are compiled."""
+    return np.require(array, dtype, ['C', 'A', 'W'])
 
 
 def _full_mask(data, mask):
@@ -71,15 +77,22 @@ def psf_arrays(model):
 
     Returns
     -------
-    nodes, x_grid, y_grid, integrated : tuple
-        The mixtures at the nodes (M, K, 6), the axes of the grid, and
-        whether they are integrated over pixels.
+    nodes, paces, x_grid, y_grid, integrated : tuple
+        The mixtures at the nodes (M, K, 6), what the kernels precompute of
+        them (M, K, 4), the axes of the grid, and whether they are integrated
+        over pixels.
     """
     if isinstance(model, GriddedMixturePSF):
         grid = model._grid
-        return grid.rows, grid.x_grid, grid.y_grid, model.pixel_integrated
-    rows = np.ascontiguousarray(model.mixture.rows[None])
-    return rows, np.zeros(1), np.zeros(1), model.pixel_integrated
+        rows, x_grid, y_grid = grid.rows, grid.x_grid, grid.y_grid
+    else:
+        rows = model.mixture.rows[None]
+        x_grid = y_grid = np.zeros(1)
+    rows, x_grid, y_grid = (_as_kernels_take(a, np.float64)
+                            for a in (rows, x_grid, y_grid))
+    paces = np.empty((*rows.shape[:2], 4))
+    _kernels.paces(rows, paces)
+    return rows, paces, x_grid, y_grid, model.pixel_integrated
 
 
 def is_fixed_shape(model):
@@ -161,7 +174,7 @@ class Stars:
         ends = np.searchsorted(cost, np.arange(_CHUNK, cost[-1], _CHUNK))
         edges = np.unique(np.concatenate([[0], ends + 1, [sizes.size]]))
         edges = edges[edges <= sizes.size]
-        for first, last in zip(edges[:-1], edges[1:], strict=True):
+        for first, last in itertools.pairwise(edges):
             yield self._part(first, last)
 
     def _part(self, first, last):
@@ -225,7 +238,7 @@ def _fit_chunk(image, psf, fit_sky, max_iterations, stars):
     _kernels.fit_stars(
         image.data, image.error, image.mask, stars.starts, stars.boxes,
         stars.initial, stars.sky, stars.lower, stars.upper, stars.fixed,
-        bool(fit_sky), image.gain, *psf, max_iterations, *fits.arrays)
+        bool(fit_sky), image.gain, psf, max_iterations, *fits.arrays)
     return fits
 
 

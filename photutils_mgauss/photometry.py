@@ -19,8 +19,8 @@ from astropy.nddata import NDData
 from astropy.utils.exceptions import AstropyUserWarning
 from photutils.psf import PSFPhotometry
 
-from photutils_mgauss import _compat, _photometry_table as _table
-from photutils_mgauss import _star_fits
+from photutils_mgauss import _compat, _star_fits
+from photutils_mgauss import _photometry_table as _table
 from photutils_mgauss._photometry_result import FitInfo, FitResult
 from photutils_mgauss._validation import as_choice, as_real
 from photutils_mgauss.fitter import MixtureFitter
