@@ -147,6 +147,10 @@ def _scattered(scene):
 
 
 def _check_parallax(options, observer):
+    if options.parallax and options.recipe == 'paper':
+        msg = ("parallax must be False for the recipe 'paper', got "
+               f'{options.parallax!r}')
+        raise ValueError(msg)
     if options.parallax and observer is None:
         msg = ('parallax must be False for epochs without a place in the '
                f'sky, got {options.parallax!r}')

@@ -272,7 +272,8 @@ def alignment_table(fit, wcs_residuals):
     table['matrix'] = np.array(slope)
     table['coefficients'] = state.maps * unit
     _add_counts(table, fit, unit)
-    table['systematic'] = np.sqrt(state.floor) * unit
+    floor = np.broadcast_to(state.floor.T, (2, len(state.maps))).T
+    table['systematic'] = np.sqrt(floor) * unit
     table['wcs_residual'] = np.array(wcs_residuals) * u.mas
     table.meta.update(kind=transform.kind, degree=transform.degree,
                       xcentre=transform.centre[0],

@@ -22,6 +22,7 @@ from photutils_mgauss._motion_table import (
     residual_table,
     star_table,
 )
+from photutils_mgauss._paper_recipe import fit_paper
 from photutils_mgauss._parallax import julian_years, observer_velocity
 from photutils_mgauss._transforms import Transform
 from photutils_mgauss._validation import as_choice, as_real
@@ -159,7 +160,8 @@ class ProperMotionFitter:
     recipe : {'joint', 'two-step', 'paper'}, optional
         'joint' solves for all stars and frames together; 'two-step' finds
         the frames from the references alone; 'paper' is the recipe of
-        Nie et al., Eqs. 11-15.
+        Nie et al., Eqs. 11-15, whose frames differ by shifts, whatever
+        ``transform`` is, and which fits no parallaxes.
     references : `~astropy.table.Table`, sequence or str, optional
         Objects whose motions are known. A table with ``id`` or ``ra`` and
         ``dec`` (``x`` and ``y`` for planes), ``pmra``, ``pmdec``,
@@ -277,8 +279,12 @@ class ProperMotionFitter:
         sightings = tie_planes(sightings,
                                [epoch.is_sky for epoch in epochs],
                                options.transform)
-        return self._solution(epochs, fit(*prepare(sightings, epochs,
-                                                   options)))
+        scene, state = prepare(sightings, epochs, options)
+        if options.recipe == 'paper':
+            result = fit_paper(scene, state, self.eps_t)
+        else:
+            result = fit(scene, state)
+        return self._solution(epochs, result)
 
     def _solution(self, epochs, result):
         year = result.scene.working_year
