@@ -401,7 +401,7 @@ class Estimates:
 def solve_stars(task):
     """Return the `Estimates` of a part of the stars."""
     stars = eliminate(task.problem)
-    scaled = _scaled_rows(stars, task.factor)
+    scaled = scaled_rows(stars, task.factor)
     shift = _shift(stars.basis, task.correction)
     values, covariance = _estimate(stars, shift, scaled)
     residuals = predicted = None
@@ -465,7 +465,7 @@ def _shift(basis, correction):
     return np.swapaxes(correction @ basis, 0, 1)
 
 
-def _scaled_rows(stars, factor):
+def scaled_rows(stars, factor):
     """Return Z C for S^-1 = C C^T, shape (p, n, q)."""
     return np.stack([stars.rows(k).T @ factor
                      for k in range(len(stars.factor))])
@@ -532,7 +532,7 @@ def cross_covariance(problem, factor):
     out = np.zeros((n, p, n, p))
     if factor.size:
         scaled = np.einsum('kin,knq->niq', stars.factor,
-                           _scaled_rows(stars, factor))
+                           scaled_rows(stars, factor))
         flat = scaled.reshape(n * p, -1)
         out += (flat @ flat.T).reshape(out.shape)
     out[np.arange(n), :, np.arange(n)] += np.moveaxis(

@@ -10,8 +10,15 @@ from photutils_mgauss._fit_motions import (
     measured,
     prior_rank,
 )
-from photutils_mgauss._joint import parallax_leak, parts, run, solve_all
+from photutils_mgauss._joint import (
+    cross_covariance,
+    parallax_leak,
+    parts,
+    run,
+    solve_all,
+)
 from photutils_mgauss._parallax import tdb
+from photutils_mgauss._references import FIXED
 from photutils_mgauss._stacked import invert_2x2
 from photutils_mgauss._tangent_plane import directions
 
@@ -66,18 +73,22 @@ def at_epoch(fit, year):
 
     Positions are plane coordinates, no longer relative to an origin.
     """
+    move = _shift_in_time(fit, year)
+    values = move @ fit.estimates.values
+    values[:2] += fit.scene.origin
+    half = np.tensordot(move, fit.estimates.covariance, axes=1)
+    return values, np.einsum('ijn,kj->ikn', half, move)
+
+
+def _shift_in_time(fit, year):
+    """Return the matrix from parameters at the working epoch to a year."""
     dt = year - fit.scene.working_year
-    values, covariance = fit.estimates.values, fit.estimates.covariance
-    size = len(values)
-    move = np.eye(size)
+    move = np.eye(fit.problem.n_parameters)
     move[0, 2] = move[1, 3] = dt
     if fit.scene.options.acceleration:
         move[0, -2] = move[1, -1] = dt**2 / 2
         move[2, -2] = move[3, -1] = dt
-    values = move @ values
-    values[:2] += fit.scene.origin
-    covariance = np.einsum('ij,jkn,lk->iln', move, covariance, move)
-    return values, covariance
+    return move
 
 
 def _inverse_2x2(matrix):
@@ -91,17 +102,81 @@ def turned(plane, values, covariance):
 
     The position stays in plane coordinates, its covariance turns.
     """
-    size = len(values)
-    inverse = _inverse_2x2(plane.local_jacobian(values[:2]))
-    turn = np.zeros((size, size, values.shape[1]))
-    turn[np.arange(size), np.arange(size)] = 1.0
-    pairs = [0, 2] + ([size - 2] if size > 5 else [])
-    for k in pairs:
-        turn[k:k + 2, k:k + 2] = inverse
+    turn = _turns(plane, values[:2], len(values))
     moved = np.einsum('ijn,jn->in', turn, values)
     moved[:2] = values[:2]
     half = np.einsum('ijn,jkn->ikn', turn, covariance)
     return moved, np.einsum('ijn,kjn->ikn', half, turn)
+
+
+def _turns(plane, places, size):
+    """Return the matrices (p, p, n) from the plane's axes to local ones."""
+    inverse = _inverse_2x2(plane.local_jacobian(places))
+    turn = np.zeros((size, size, places.shape[1]))
+    turn[np.arange(size), np.arange(size)] = 1.0
+    for k in [0, 2] + [size - 2] * (size > 5):
+        turn[k:k + 2, k:k + 2] = inverse
+    return turn
+
+
+def star_covariance(fit, stars, ref_year):
+    """Return covariances (k, p, k, p) in Gaia's order, at an epoch."""
+    problem = fit.problem.select(stars)
+    covariance = cross_covariance(problem, fit.frames.factor)
+    size = problem.n_parameters
+    change = np.repeat(_shift_in_time(fit, ref_year)[None], len(stars), 0)
+    plane = fit.scene.sightings.plane
+    if plane is not None:
+        places = at_epoch(fit, ref_year)[0][:2, stars]
+        change = _turns(plane, places, size).transpose(2, 0, 1) @ change
+    covariance = np.einsum('kij,kjlm,lnm->kiln', change, covariance, change)
+    order = [k for k in FROM_OURS if k < size] if (
+        fit.scene.options.parallax) else [0, 1, 2, 3]
+    return covariance[:, order][:, :, :, order]
+
+
+def validation_table(fit, stars):
+    """Return held-out references beside their catalogue values."""
+    sightings, held = fit.scene.sightings, fit.scene.held
+    unit = u.Unit(sightings.unit) / u.yr
+    motion, covariance = _catalogue_motions(sightings, held)
+    rows = stars[held]
+    table = QTable({'id': rows['id']})
+    away, errors = [], []
+    for k, name in enumerate(('pmra', 'pmdec')):
+        away.append(rows[name].to_value(unit) - motion[k])
+        errors.append(np.sqrt(rows[f'{name}_error'].to_value(unit)**2
+                              + covariance[k, k]))
+        table[f'd{name}'] = away[k] * unit
+        table[f'd{name}_error'] = errors[k] * unit
+    cross = covariance[0, 1] + (rows['pmra_pmdec_corr']
+                                * rows['pmra_error'].to_value(unit)
+                                * rows['pmdec_error'].to_value(unit))
+    a, b, c = invert_2x2(errors[0]**2, cross, errors[1]**2)
+    x, y = away
+    table['chi2'] = a * x * x + 2 * b * x * y + c * y * y
+    return table
+
+
+def _catalogue_motions(sightings, stars):
+    """Return catalogue motions (2, k) and covariances in local axes."""
+    motion = np.zeros((2, len(stars)))
+    covariance = np.zeros((2, 2, len(stars)))
+    if sightings.catalogue is None:
+        return motion, covariance
+    place = {star: k for k, star in enumerate(sightings.references)}
+    which = [place[star] for star in stars]
+    catalogue = sightings.catalogue
+    motion = catalogue.motion()[:, which]
+    moves = ~np.isin(catalogue.kinds[which], FIXED)
+    covariance = catalogue.covariance[2:4, 2:4][..., which] * moves
+    if sightings.plane is not None:
+        turn = _inverse_2x2(sightings.plane.local_jacobian(
+            catalogue.values[:2, which]))
+        turn = np.where(np.isfinite(turn), turn, np.eye(2)[..., None])
+        motion = np.einsum('ijn,jn->in', turn, motion)
+        covariance = np.einsum('ijn,jkn,lkn->iln', turn, covariance, turn)
+    return motion, covariance
 
 
 def star_table(fit, ref_year):
