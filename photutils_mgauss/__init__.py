@@ -25,7 +25,9 @@ _OWNERS = {
     'GriddedMixturePSF': 'gridded',
     'MultiGaussianPSFModel': 'model',
     'GaussianMixture': 'mixture',
+    'PSFExModel': 'psf_io',
     'blend': 'mixture',
+    'read_psfex': 'psf_io',
 }
 
 __all__ = ['__version__', *_OWNERS]
