@@ -28,6 +28,9 @@ _OWNERS = {
     'PSFExModel': 'psf_io',
     'blend': 'mixture',
     'read_psfex': 'psf_io',
+    'FitStatus': 'fitting',
+    'MixtureFit': 'fitting',
+    'fit_mixture': 'fitting',
 }
 
 __all__ = ['__version__', *_OWNERS]

@@ -404,3 +404,537 @@ def render_grid(x, y, flux, left, bottom, nodes, x_grid, y_grid, integrated,
             if w != 0:
                 render(nodes[index[corner]], x[i] - left[i], y[i] - bottom[i],
                        w, integrated, out[i])
+
+
+# Least-squares fits of a mixture to a stamp. Everything is in stamp pixels
+# about a centre near the middle of the stamp. A Gaussian of flux f is a row of
+# five shape numbers, x, y, log l, t, log m, the mean and the Cholesky factor
+# of the precision matrix:
+#
+#     g = f l m / (2 pi) exp(-(a^2 + b^2) / 2),  a = l u + t v,  b = m v,
+#
+# with (u, v) the offset from the mean. Every parameter vector is a Gaussian.
+# All derivatives are g times a polynomial of degree 2 in x and y, so the
+# normal matrix follows from the moments up to degree 4 of the products of two
+# Gaussians: 5 sums a pixel and pair where the Jacobian would need 21 and more.
+#
+# The fluxes are linear. They are solved for exactly at every step, and the
+# shapes move along the Jacobian projected off them (variable projection in
+# Kaufman's form); the joint normal matrix with undamped fluxes does both.
+
+_LOG_2PI = float(np.log(2 * np.pi))
+
+# Rows of `limits`, see `penalty`.
+_NARROW, _WIDE, _REACH_X, _REACH_Y, _STIFFNESS = range(5)
+
+# What fit_stamp returns.
+FIT_CONVERGED, FIT_STOPPED = range(2)
+
+
+@_jit
+def draw_unit(shapes, cx, cy, images):
+    """Put Gaussians of unit flux into images (K, ny, nx)."""
+    for k in range(shapes.shape[0]):
+        mx, my, log_l, t, log_m = shapes[k]
+        length, m = exp(log_l), exp(log_m)
+        peak = exp(log_l + log_m - _LOG_2PI)
+        for j in range(images.shape[1]):
+            row = images[k, j]
+            row[:] = 0.0
+            v = j - cy - my
+            q = m * m * v * v
+            if q < _LOG_NOTHING:
+                _add_row(peak * exp(-0.5 * q), -cx - mx + t / length * v,
+                         length * length, row)
+
+
+@_jit
+def _moments_of_product(a, b, weight, cx, cy, order, out):
+    """
+    Put sum_pixels w a b x^n y^m into out[n, m] for n + m <= order <= 4.
+    """
+    out[:order + 1, :order + 1] = 0.0
+    for i in range(a.shape[1]):
+        s0, s1, s2, s3, s4 = 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(a.shape[0]):
+            v = j - cy
+            h = weight[j, i] * a[j, i] * b[j, i]
+            hv = h * v
+            hvv = hv * v
+            s0 += h
+            s1 += hv
+            s2 += hvv
+            if order > 2:
+                s3 += hvv * v
+                s4 += hvv * v * v
+        x = i - cx
+        power = 1.0
+        for n in range(order + 1):
+            out[n, 0] += power * s0
+            if n + 1 <= order:
+                out[n, 1] += power * s1
+            if n + 2 <= order:
+                out[n, 2] += power * s2
+            if n + 3 <= order:
+                out[n, 3] += power * s3
+            if n + 4 <= order:
+                out[n, 4] += power * s4
+            power *= x
+
+
+@_jit
+def _polynomials(shape, out):
+    """
+    Put g and its derivatives by the five shape numbers into out (6, 6).
+
+    As multiples of g: the coefficients of 1, x, y, xx, xy, yy.
+    """
+    mx, my, log_l, t, log_m = shape
+    length, m = exp(log_l), exp(log_m)
+    # a = length x + t y + a0, b = m y + b0.
+    a0 = -length * mx - t * my
+    b0 = -m * my
+    out[:] = 0.0
+    out[0, 0] = 1.0
+    out[1, 0], out[1, 1], out[1, 2] = length * a0, length * length, length * t
+    out[2, 0] = t * a0 + m * b0
+    out[2, 1] = t * length
+    out[2, 2] = t * t + m * m
+    # 1 - length u a
+    out[3, 0] = 1.0 + length * mx * a0
+    out[3, 1] = -length * a0 + length * mx * length
+    out[3, 2] = length * mx * t
+    out[3, 3] = -length * length
+    out[3, 4] = -length * t
+    # -v a
+    out[4, 0] = my * a0
+    out[4, 1] = my * length
+    out[4, 2] = my * t - a0
+    out[4, 4] = -length
+    out[4, 5] = -t
+    # 1 - b^2
+    out[5, 0] = 1.0 - b0 * b0
+    out[5, 2] = -2 * m * b0
+    out[5, 5] = -m * m
+
+
+@_jit
+def _contract(left, moments, right, half, out):
+    """
+    Put the moments of a product, seen by its parameters, into out (6, 6).
+
+    left and right (6, 6) are the polynomials of the two Gaussians; half (6,)
+    is scratch.
+    """
+    for i in range(6):
+        for c in range(6):
+            total = 0.0
+            for a in range(6):
+                total += left[i, a] * moments[_POWER_X[a] + _POWER_X[c],
+                                              _POWER_Y[a] + _POWER_Y[c]]
+            half[c] = total
+        for j in range(6):
+            total = 0.0
+            for c in range(6):
+                total += half[c] * right[j, c]
+            out[i, j] = total
+
+
+_POWER_X = np.array([0, 1, 0, 2, 1, 0])
+_POWER_Y = np.array([0, 0, 1, 0, 1, 2])
+
+
+@_jit
+def _factor(matrix, n):
+    """
+    Overwrite the lower triangle of matrix (n, n) by its Cholesky factor.
+
+    A pivot lost to rounding is replaced by a huge one, which sets the unknown
+    to zero instead of ending the fit.
+    """
+    for j in range(n):
+        diagonal = matrix[j, j]
+        pivot = diagonal
+        for k in range(j):
+            pivot -= matrix[j, k] * matrix[j, k]
+        if not pivot > 1e-14 * diagonal:
+            pivot = 1e30 * max(diagonal, 1e-30)
+        root = sqrt(pivot)
+        matrix[j, j] = root
+        for i in range(j + 1, n):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = total / root
+
+
+@_jit
+def _solve_factored(factor, n, x):
+    """Overwrite x (n,) by the solution of factor factor^T y = x."""
+    for i in range(n):
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= factor[k, i] * x[k]
+        x[i] /= factor[i, i]
+
+
+@_jit
+def _solve_subset(gram, rhs, active, x, work):
+    """Solve gram x = rhs over the active unknowns; the others are zero."""
+    n = rhs.size
+    count = 0
+    for i in range(n):
+        if not active[i]:
+            continue
+        column = 0
+        for j in range(i + 1):
+            if active[j]:
+                work[count, column] = gram[i, j]
+                column += 1
+        work[count, n] = rhs[i]
+        count += 1
+    _factor(work, count)
+    solution = work[:count, n].copy()
+    _solve_factored(work, count, solution)
+    count = 0
+    for i in range(n):
+        x[i] = 0.0
+        if active[i]:
+            x[i] = solution[count]
+            count += 1
+
+
+@_jit
+def _solve_fluxes(gram, rhs, signed, x, active, work):
+    """
+    Solve min |G x - z| given gram = G^T G and rhs = G^T z; x >= 0 unless signed.
+
+    Lawson and Hanson's active set, started from all unknowns free. work is
+    (n, n + 1).
+    """
+    n = rhs.size
+    active[:] = True
+    _solve_subset(gram, rhs, active, x, work)
+    if signed:
+        return
+    for _ in range(3 * n):
+        worst = np.argmin(x)
+        if x[worst] < 0:
+            active[worst] = False
+            _solve_subset(gram, rhs, active, x, work)
+            continue
+        best, gain = -1, 0.0
+        for i in range(n):
+            if active[i]:
+                continue
+            slope = rhs[i]
+            for j in range(n):
+                slope -= gram[i, j] * x[j]
+            if slope > 1e-12 * abs(rhs[i]) + gain:
+                best, gain = i, slope
+        if best < 0:
+            return
+        active[best] = True
+        _solve_subset(gram, rhs, active, x, work)
+        if x[best] <= 0:
+            active[best] = False
+            _solve_subset(gram, rhs, active, x, work)
+            return
+    for i in range(n):
+        x[i] = max(x[i], 0.0)
+
+
+@_jit
+def _hinge(excess, slopes, stiffness, matrix, gradient):
+    """Add the square of an excess > 0 to the normal equations of one shape."""
+    if excess <= 0:
+        return 0.0
+    for i in range(5):
+        gradient[i] -= stiffness * excess * slopes[i]
+        for j in range(5):
+            matrix[i, j] += stiffness * slopes[i] * slopes[j]
+    return stiffness * excess * excess
+
+
+@_jit
+def penalty(shape, limits, matrix, gradient):
+    """
+    Return the price of a Gaussian outside its limits.
+
+    The limits hold for the widths of its cuts along x and y (not narrower
+    than the pixels can show) and of its projections (not wider than the
+    stamp), and for its mean (on the stamp). Inside them the price is zero; it
+    grows with the square of the excess. matrix (5, 5) and gradient (5,)
+    receive its share of the normal equations.
+    """
+    x, y, log_l, t, log_m = shape
+    length, m = exp(log_l), exp(log_m)
+    stiffness = limits[_STIFFNESS]
+    slopes = np.zeros(5)
+    slopes[2] = 1.0
+    price = _hinge(log_l + limits[_NARROW], slopes, stiffness, matrix,
+                   gradient)
+    norm = t * t + m * m
+    slopes[2], slopes[3], slopes[4] = 0.0, t / norm, m * m / norm
+    price += _hinge(0.5 * np.log(norm) + limits[_NARROW], slopes, stiffness,
+                    matrix, gradient)
+    slopes[2], slopes[4] = -1.0, m * m / norm - 1
+    price += _hinge(0.5 * np.log(norm) - log_l - log_m - limits[_WIDE],
+                    slopes, stiffness, matrix, gradient)
+    slopes[2], slopes[3], slopes[4] = 0.0, 0.0, -1.0
+    price += _hinge(-log_m - limits[_WIDE], slopes, stiffness, matrix,
+                    gradient)
+    slopes[4] = 0.0
+    slopes[0] = 1 / limits[_REACH_X] if x > 0 else -1 / limits[_REACH_X]
+    price += _hinge(abs(x) / limits[_REACH_X] - 1, slopes, stiffness, matrix,
+                    gradient)
+    slopes[0] = 0.0
+    slopes[1] = 1 / limits[_REACH_Y] if y > 0 else -1 / limits[_REACH_Y]
+    price += _hinge(abs(y) / limits[_REACH_Y] - 1, slopes, stiffness, matrix,
+                    gradient)
+    return price
+
+
+@_jit
+def _residual(stamp, weight, images, fluxes, out):
+    """Put stamp minus model into out (ny, nx); return its chi square."""
+    chi2 = 0.0
+    for j in range(stamp.shape[0]):
+        for i in range(stamp.shape[1]):
+            r = stamp[j, i]
+            for k in range(fluxes.size):
+                r -= fluxes[k] * images[k, j, i]
+            out[j, i] = r
+            chi2 += weight[j, i] * r * r
+    return chi2
+
+
+@_jit
+def project(stamp, weight, centre, shapes, tie, signed, fluxes, scratch):
+    """
+    Put the best fluxes for the shapes into fluxes; return the chi square.
+
+    tie is the total flux and the weight of that condition (0: free). The
+    images and the residual are left in scratch.
+    """
+    images, residual, gram, rhs, work, active = scratch[:6]
+    total, tie_weight = tie
+    draw_unit(shapes, centre[0], centre[1], images)
+    n = fluxes.size
+    for k in range(n):
+        rhs[k] = _weighted_dot(images[k], stamp, weight) + tie_weight * total
+        for other in range(k + 1):
+            dot = _weighted_dot(images[k], images[other], weight) + tie_weight
+            gram[k, other] = gram[other, k] = dot
+    _solve_fluxes(gram, rhs, signed, fluxes, active, work)
+    chi2 = _residual(stamp, weight, images, fluxes, residual)
+    lack = fluxes.sum() - total
+    return chi2 + tie_weight * lack * lack
+
+
+@_jit
+def _weighted_dot(a, b, weight):
+    total = 0.0
+    for j in range(a.shape[0]):
+        for i in range(a.shape[1]):
+            total += weight[j, i] * a[j, i] * b[j, i]
+    return total
+
+
+@_jit
+def normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
+                      gradient):
+    """
+    Put the normal equations into matrix (6K, 6K) and gradient (6K,).
+
+    The unknowns are the K fluxes and five shape numbers for each Gaussian.
+    The images and the residual come from `project`.
+    """
+    images, residual = scratch[:2]
+    polynomials, moments, half, block = scratch[6:]
+    n = fluxes.size
+    for k in range(n):
+        _polynomials(shapes[k], polynomials[k])
+        _moments_of_product(images[k], residual, weight, centre[0], centre[1],
+                            2, moments)
+        for i in range(6):
+            slope = 0.0
+            for a in range(6):
+                slope += (polynomials[k, i, a]
+                          * moments[_POWER_X[a], _POWER_Y[a]])
+            gradient[_unknown(n, k, i)] = slope * (fluxes[k] if i else 1.0)
+    for k in range(n):
+        for other in range(k + 1):
+            _moments_of_product(images[k], images[other], weight, centre[0],
+                                centre[1], 4, moments)
+            _contract(polynomials[k], moments, polynomials[other], half,
+                      block)
+            _place(block, k, other, fluxes, matrix)
+            matrix[k, other] += tie[1]
+            matrix[other, k] = matrix[k, other]
+
+
+@_jit
+def _unknown(n, k, i):
+    """Return where number i (0: flux) of Gaussian k of n is stored."""
+    return k if i == 0 else n + 5 * k + i - 1
+
+
+@_jit
+def _place(block, k, other, fluxes, matrix):
+    """Write the 6x6 block of two Gaussians into the normal matrix."""
+    n = fluxes.size
+    for i in range(6):
+        row = _unknown(n, k, i)
+        scale = fluxes[k] if i else 1.0
+        for j in range(6):
+            column = _unknown(n, other, j)
+            value = scale * block[i, j] * (fluxes[other] if j else 1.0)
+            matrix[row, column] = value
+            matrix[column, row] = value
+
+
+@_jit
+def add_penalties(shapes, limits, matrix, gradient):
+    """Add the limits to the normal equations; return their price."""
+    n = shapes.shape[0]
+    price = 0.0
+    for k in range(n):
+        first = n + 5 * k
+        price += penalty(shapes[k], limits,
+                          matrix[first:first + 5, first:first + 5],
+                          gradient[first:first + 5])
+    return price
+
+
+@_jit
+def _step(matrix, gradient, fluxes, damping, fixed_means, factor, step):
+    """
+    Put the damped step of all unknowns into step (6K,).
+
+    The fluxes are not damped. A Gaussian without flux stands still. Returns
+    the predicted decrease of the cost.
+    """
+    n = fluxes.size
+    size = gradient.size
+    floor = 0.0
+    for i in range(n, size):
+        floor = max(floor, matrix[i, i])
+    for i in range(size):
+        k = i if i < n else (i - n) // 5
+        still = fluxes[k] == 0 or (fixed_means and i >= n
+                                   and (i - n) % 5 < 2)
+        step[i] = 0.0 if still else gradient[i]
+        for j in range(i):
+            other = j if j < n else (j - n) // 5
+            factor[i, j] = (0.0 if still or fluxes[other] == 0
+                            else matrix[i, j])
+        factor[i, i] = matrix[i, i]
+        if i >= n:
+            factor[i, i] += damping * (matrix[i, i] + 1e-9 * floor)
+        if still:
+            factor[i, i] = 1.0
+    if fixed_means:
+        _uncouple_means(n, factor)
+    _factor(factor, size)
+    _solve_factored(factor, size, step)
+    gain = 0.0
+    for i in range(n, size):
+        gain += step[i] * (gradient[i] + damping * step[i]
+                           * (matrix[i, i] + 1e-9 * floor))
+    return gain
+
+
+@_jit
+def _uncouple_means(n, factor):
+    for k in range(n):
+        for c in range(2):
+            i = n + 5 * k + c
+            for j in range(i + 1, factor.shape[0]):
+                factor[j, i] = 0.0
+
+
+@_jit
+def _move(shapes, step, out):
+    """Put shapes moved by the step into out, no width by more than e-fold."""
+    n = shapes.shape[0]
+    for k in range(n):
+        for i in range(5):
+            change = step[n + 5 * k + i]
+            if i == 2 or i == 4:
+                change = min(max(change, -1.0), 1.0)
+            out[k, i] = shapes[k, i] + change
+
+
+@_jit
+def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
+               fixed_means, limits, tolerance, max_steps, scratch, matrices,
+               vectors):
+    """
+    Fit K Gaussians to a stamp by Levenberg-Marquardt, in place.
+
+    Parameters
+    ----------
+    stamp, weight : (ny, nx)
+        Pixels and their weights; a weight of 0 leaves a pixel out, whatever
+        finite number is in it.
+    centre : (2,)
+        The pixel x, y to which the means are relative.
+    shapes, fluxes : (K, 5), (K,)
+        Where to start (the fluxes are only written), and the result.
+    tie : (2,)
+        The total flux and the weight of that condition (0: free).
+    signed, fixed_means : bool
+        Whether fluxes may be negative; whether means stay as they are.
+    limits : (5,)
+        See `penalty`.
+    tolerance, max_steps
+        Stop when two steps running lower the cost by less than this fraction,
+        or after so many steps.
+    scratch, matrices, vectors
+        From `fitting.Workspace`.
+
+    Returns
+    -------
+    cost, status, steps
+    """
+    matrix, factor = matrices
+    gradient, step, trial, trial_fluxes = vectors
+    idle_matrix, idle_gradient = factor, step
+    cost = project(stamp, weight, centre, shapes, tie, signed, fluxes,
+                    scratch)
+    normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
+                      gradient)
+    cost += add_penalties(shapes, limits, matrix, gradient)
+    damping, growth, small = 1e-2, 2.0, 0
+    for n_steps in range(1, max_steps + 1):
+        gain = _step(matrix, gradient, fluxes, damping, fixed_means, factor,
+                     step)
+        _move(shapes, step, trial)
+        trial_cost = project(stamp, weight, centre, trial, tie, signed,
+                              trial_fluxes, scratch)
+        trial_cost += add_penalties(trial, limits, idle_matrix,
+                                     idle_gradient)
+        if not trial_cost < cost:
+            damping *= growth
+            growth *= 2
+            if damping > 1e12 or not gain > 1e-14 * cost:
+                return cost, FIT_CONVERGED, n_steps
+            continue
+        drop = cost - trial_cost
+        shapes[:] = trial
+        fluxes[:] = trial_fluxes
+        normal_equations(weight, centre, shapes, fluxes, tie, scratch,
+                          matrix, gradient)
+        add_penalties(shapes, limits, matrix, gradient)
+        small = small + 1 if drop <= tolerance * cost else 0
+        cost = trial_cost
+        if small >= 2:
+            return cost, FIT_CONVERGED, n_steps
+        quality = 2 * drop / max(gain, 1e-300) - 1
+        damping = max(damping * max(0.2, 1 - quality ** 3), 1e-15)
+        growth = 2.0
+    return cost, FIT_STOPPED, max_steps
