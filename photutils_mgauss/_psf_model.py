@@ -9,19 +9,7 @@ from photutils_mgauss import _compat
 
 
 class PSFParameter(Parameter):
-    """A Parameter that tells its model when it is freed or fixed."""
-
-    @property
-    def fixed(self):
-        """Whether the parameter is kept fixed during fitting."""
-        return super().fixed
-
-    @fixed.setter
-    def fixed(self, value):
-        Parameter.fixed.fset(self, value)
-        model = getattr(self, '_model', None)
-        if model is not None:
-            model._refresh_identity()
+    """A Parameter that is cheap to copy."""
 
     def bound_copy(self, model):
         """Return a copy that belongs to ``model``, at a tenth of deepcopy."""
@@ -49,18 +37,15 @@ class PSFModel(Fittable2DModel):
     # its flux.
     bbox_factor = 5.5
 
-    def __str__(self):
-        public = _compat.public_class(self).__name__
-        return super().__str__().replace(type(self).__name__, public)
+    if _compat.STALE_GROUP_MODELS:
+        __class__ = property(_compat.group_class)
 
-    def _refresh_identity(self):
-        # Called from Parameters while the model is still being built, too.
-        if '_ready' in self.__dict__:
-            _compat.set_identity(self, self._state)
+    def __str__(self):
+        return super().__str__().replace(self.__class__.__name__,
+                                         type(self).__name__)
 
     def _finish(self):
         self._ready = True
-        self._refresh_identity()
 
     @property
     def bounding_box(self):
@@ -109,11 +94,9 @@ class PSFModel(Fittable2DModel):
         return copy.deepcopy(self)
 
     def __reduce__(self):
-        return _new_model, (_compat.public_class(self),), self.__dict__
-
-    def __setstate__(self, state):
-        self.__dict__.update(state)
-        self._refresh_identity()
+        state = {key: value for key, value in self.__dict__.items()
+                 if key != '_group_class'}
+        return _new_model, (type(self),), state
 
     @property
     def input_units(self):
