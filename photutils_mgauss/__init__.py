@@ -28,8 +28,11 @@ _OWNERS = {
     'PSFExModel': 'psf_io',
     'blend': 'mixture',
     'read_psfex': 'psf_io',
+    'adaptive_moments': 'shapes',
     'FitStatus': 'fitting',
     'MixtureFit': 'fitting',
+    'Shapes': 'shapes',
+    'ShapeStatus': 'shapes',
     'fit_mixture': 'fitting',
 }
 
