@@ -20,10 +20,12 @@ factors of its exponent when :math:`x` is conditioned on :math:`y`,
 This form loses no digits to cancellation when the Gaussian is thin and
 tilted, and it is what a walk along a pixel row needs.
 """
-from math import ceil, erf, exp, sqrt
+from decimal import Decimal
+from math import ceil, erf, exp, factorial, sqrt
 
 import numpy as np
-from numba import njit
+from numba import njit, types
+from numba.extending import intrinsic
 
 _jit = njit(cache=True, nogil=True, error_model='numpy')
 
@@ -39,6 +41,55 @@ _NOTHING = 1e-290
 _LOG_NOTHING = -2 * np.log(_NOTHING)
 
 _HALF_PI_ROOT = sqrt(np.pi / 2)
+
+
+# The exponential function, in a form that the compiler turns into vector
+# instructions: four to five times as fast in a loop over pixels as the one of
+# the C library, and as accurate.
+
+# 1.5 * 2^52: adding it rounds to an integer, which then is in the low bits.
+_ROUND = 1.5 * 2.0**52
+_LOG2_E = 1 / np.log(2)
+# log(2) in two parts; 32 bits times an exponent of 11 bits make no error.
+_LOG2_HIGH = np.floor(np.log(2) * 2.0**32) / 2.0**32
+_LOG2_LOW = float(Decimal(2).ln() - Decimal(_LOG2_HIGH))
+# Taylor's series; |r| < log(2) / 2 leaves 4e-18 after 13 terms.
+_TERMS = tuple(1 / factorial(n) for n in range(13, -1, -1))
+
+
+@intrinsic
+def _float_of_bits(context, bits):
+    def generate(context, builder, signature, args):
+        return builder.bitcast(args[0],
+                               context.get_value_type(types.float64))
+    return types.float64(types.int64), generate
+
+
+@intrinsic
+def _bits_of_float(context, number):
+    def generate(context, builder, signature, args):
+        return builder.bitcast(args[0], context.get_value_type(types.int64))
+    return types.int64(types.float64), generate
+
+
+@_jit
+def _exp(x):
+    """Return exp(x) for x <= 0, and 0 where that is below 1e-299."""
+    shifted = x * _LOG2_E + _ROUND
+    n = shifted - _ROUND
+    r = (x - n * _LOG2_HIGH) - n * _LOG2_LOW
+    series = _TERMS[0]
+    for term in _TERMS[1:]:
+        series = series * r + term
+    power = _float_of_bits((_bits_of_float(shifted) + 1023) << 52)
+    return 0.0 if x < -688 else series * power
+
+
+@_jit
+def exponentials(x, out):
+    """Put exp(x), x <= 0, into out (n,); for tests."""
+    for i in range(x.size):
+        out[i] = _exp(x[i])
 
 
 # One Gaussian at one point. (dx, dy) is the offset from the centre.
@@ -155,14 +206,57 @@ def _hessian(dx, dy, p, s, q, integrated):
 # Mixtures at arbitrary points. rows is (K, 6); x and y are (n,).
 
 @_jit
+def _add_values(x, y, x_0, y_0, row, scale, integrated, out):
+    """Add a Gaussian, centred on (x_0, y_0) plus its mean, to out (n,)."""
+    a, mx, my, p, s, q = row
+    peak = scale * a
+    left, bottom = x_0 + mx, y_0 + my
+    if integrated:
+        for i in range(x.size):
+            out[i] += peak * _pixel_integral(x[i] - left, y[i] - bottom, p, s,
+                                             q)
+        return
+    for i in range(x.size):
+        dy = y[i] - bottom
+        u = x[i] - left - s * dy
+        out[i] += peak * _exp(-0.5 * (p * u * u + q * dy * dy))
+
+
+@_jit
+def _add_jet(x, y, x_0, y_0, row, scales, integrated, out):
+    """
+    Add value, slope by x_0 and slope by y_0 of a Gaussian to out (3, n).
+
+    scales (3,) is what multiplies it, and the slopes of that.
+    """
+    a, mx, my, p, s, q = row
+    value, by_x, by_y = a * scales[0], a * scales[1], a * scales[2]
+    left, bottom = x_0 + mx, y_0 + my
+    if integrated:
+        for i in range(x.size):
+            dx, dy = x[i] - left, y[i] - bottom
+            g = _pixel_integral(dx, dy, p, s, q)
+            gx, gy = _gradient(dx, dy, p, s, q, True)
+            out[0, i] += value * g
+            out[1, i] += by_x * g - value * gx
+            out[2, i] += by_y * g - value * gy
+        return
+    for i in range(x.size):
+        dy = y[i] - bottom
+        u = x[i] - left - s * dy
+        g = _exp(-0.5 * (p * u * u + q * dy * dy))
+        slope = p * u
+        out[0, i] += value * g
+        out[1, i] += (by_x + value * slope) * g
+        out[2, i] += (by_y + value * (q * dy - s * slope)) * g
+
+
+@_jit
 def evaluate(x, y, rows, integrated, out):
     """Put the mixture at the points into out (n,)."""
-    for i in range(x.size):
-        total = 0.0
-        for k in range(rows.shape[0]):
-            a, mx, my, p, s, q = rows[k]
-            total += a * _value(x[i] - mx, y[i] - my, p, s, q, integrated)
-        out[i] = total
+    out[:] = 0.0
+    for k in range(rows.shape[0]):
+        _add_values(x, y, 0.0, 0.0, rows[k], 1.0, integrated, out)
 
 
 @_jit
@@ -327,26 +421,26 @@ def evaluate_grid(x, y, flux, x_0, y_0, nodes, x_grid, y_grid, integrated,
     """
     Put the blended PSF at the points into out (n,).
 
-    flux, x_0 and y_0 have one element or n.
+    flux has one element or n; x_0 and y_0 have one element, or n for a star
+    of its own at each point.
     """
     index = np.empty(4, np.int64)
     weights = np.empty((3, 4))
-    for i in range(x.size):
-        c = i if x_0.size > 1 else 0
-        if i == 0 or x_0.size > 1:
-            blend_weights(x_0[c], y_0[c], x_grid, y_grid, index, weights)
-        total = 0.0
+    per_point = x_0.size > 1
+    out[:] = 0.0
+    for star in range(x_0.size):
+        points = slice(star, star + 1) if per_point else slice(0, x.size)
+        blend_weights(x_0[star], y_0[star], x_grid, y_grid, index, weights)
         for corner in range(4):
-            if weights[0, corner] == 0:
+            w = weights[0, corner]
+            if w == 0:
                 continue
-            part = 0.0
-            for k in range(nodes.shape[1]):
-                a, mx, my, p, s, q = nodes[index[corner], k]
-                if a != 0:
-                    part += a * _value(x[i] - x_0[c] - mx, y[i] - y_0[c] - my,
-                                       p, s, q, integrated)
-            total += weights[0, corner] * part
-        out[i] = total * flux[i if flux.size > 1 else 0]
+            for row in nodes[index[corner]]:
+                if row[0] != 0:
+                    _add_values(x[points], y[points], x_0[star], y_0[star],
+                                row, w, integrated, out[points])
+    for i in range(x.size):
+        out[i] *= flux[i if flux.size > 1 else 0]
 
 
 @_jit
@@ -361,30 +455,35 @@ def differentiate_grid(x, y, x_0, y_0, nodes, x_grid, y_grid, integrated,
     index = np.empty(4, np.int64)
     weights = np.empty((3, 4))
     blend_weights(x_0, y_0, x_grid, y_grid, index, weights)
-    for i in range(x.size):
-        total = 0.0
-        by_x = 0.0
-        by_y = 0.0
-        for corner in range(4):
-            value = 0.0
-            gx = 0.0
-            gy = 0.0
-            for k in range(nodes.shape[1]):
-                a, mx, my, p, s, q = nodes[index[corner], k]
-                if a == 0:
-                    continue
-                dx, dy = x[i] - x_0 - mx, y[i] - y_0 - my
-                dgx, dgy = _gradient(dx, dy, p, s, q, integrated)
-                value += a * _value(dx, dy, p, s, q, integrated)
-                gx += a * dgx
-                gy += a * dgy
-            w = weights[0, corner]
-            total += w * value
-            by_x += weights[1, corner] * value - w * gx
-            by_y += weights[2, corner] * value - w * gy
-        out[0, i] = total
-        out[1, i] = by_x
-        out[2, i] = by_y
+    out[:] = 0.0
+    for corner in range(4):
+        for row in nodes[index[corner]]:
+            if row[0] != 0:
+                _add_jet(x, y, x_0, y_0, row, weights[:, corner], integrated,
+                         out)
+
+
+@_jit
+def _add_stamp(rows, x_0, y_0, flux, integrated, px, py, out):
+    """Add a star to a stamp (ny, nx) whose pixels are at px and py (n,)."""
+    if integrated:
+        render(rows, x_0, y_0, flux, integrated, out)
+        return
+    # A stamp has few pixels in a row: taken as one row, it fills vectors.
+    for row in rows:
+        if row[0] != 0:
+            _add_values(px, py, x_0, y_0, row, flux, False,
+                        out.reshape(px.size))
+
+
+@_jit
+def _pixel_positions(ny, nx):
+    px = np.empty(ny * nx)
+    py = np.empty(ny * nx)
+    for i in range(px.size):
+        py[i] = i // nx
+        px[i] = i % nx
+    return px, py
 
 
 @_jit
@@ -397,13 +496,135 @@ def render_grid(x, y, flux, left, bottom, nodes, x_grid, y_grid, integrated,
     """
     index = np.empty(4, np.int64)
     weights = np.empty((3, 4))
+    px, py = _pixel_positions(out.shape[1], out.shape[2])
     for i in range(x.size):
         blend_weights(x[i], y[i], x_grid, y_grid, index, weights)
         for corner in range(4):
             w = weights[0, corner] * flux[i]
             if w != 0:
-                render(nodes[index[corner]], x[i] - left[i], y[i] - bottom[i],
-                       w, integrated, out[i])
+                _add_stamp(nodes[index[corner]], x[i] - left[i],
+                           y[i] - bottom[i], w, integrated, px, py, out[i])
+
+
+# A grid of mixtures whose Gaussians are matched, blended one by one: the four
+# that belong together are replaced by the one with the flux, centroid and
+# second moments of their sum. sums is (M, K, 6) and holds of each Gaussian
+# the integrals of 1, x, y, x^2, xy, y^2, which blend linearly.
+
+@_jit
+def match_rows(x_0, y_0, sums, x_grid, y_grid, rows, slopes):
+    """
+    Put the K blended Gaussians at (x_0, y_0) into rows (K, 6).
+
+    slopes (2, K, 6) takes the derivatives by x_0 and y_0 of log flux, mean
+    and covariance (xx, xy, yy).
+    """
+    index = np.empty(4, np.int64)
+    weights = np.empty((3, 4))
+    blend_weights(x_0, y_0, x_grid, y_grid, index, weights)
+    blended = np.empty(6)
+    slope = np.empty(6)
+    for k in range(rows.shape[0]):
+        _blend_sums(index, weights[0], sums, k, blended)
+        rows[k] = 0.0
+        slopes[:, k] = 0.0
+        if blended[0] == 0:
+            rows[k, 3] = rows[k, 5] = 1.0
+            continue
+        f, mx, my, sxx, sxy, syy = _central(blended)
+        s = sxy / syy
+        p = 1 / (sxx - s * sxy)
+        rows[k] = np.array([f * sqrt(p / syy) / (2 * np.pi), mx, my, p, s,
+                            1 / syy])
+        for axis in range(2):
+            _blend_sums(index, weights[1 + axis], sums, k, slope)
+            df = slope[0] / f
+            dx = slope[1] / f - mx * df
+            dy = slope[2] / f - my * df
+            slopes[axis, k, 0] = df
+            slopes[axis, k, 1] = dx
+            slopes[axis, k, 2] = dy
+            slopes[axis, k, 3] = (slope[3] / f - (sxx + mx * mx) * df
+                                  - 2 * mx * dx)
+            slopes[axis, k, 4] = (slope[4] / f - (sxy + mx * my) * df
+                                  - mx * dy - my * dx)
+            slopes[axis, k, 5] = (slope[5] / f - (syy + my * my) * df
+                                  - 2 * my * dy)
+
+
+@_jit
+def _blend_sums(index, weights, sums, k, out):
+    for j in range(6):
+        out[j] = 0.0
+        for corner in range(4):
+            out[j] += weights[corner] * sums[index[corner], k, j]
+
+
+@_jit
+def _central(sums):
+    """Return flux, mean and covariance of what has these integrals."""
+    f = sums[0]
+    mx, my = sums[1] / f, sums[2] / f
+    return (f, mx, my, sums[3] / f - mx * mx, sums[4] / f - mx * my,
+            sums[5] / f - my * my)
+
+
+@_jit
+def evaluate_matched(x, y, flux, x_0, y_0, sums, x_grid, y_grid, integrated,
+                     out):
+    """Put the PSF of matched Gaussians into out; as `evaluate_grid`."""
+    rows = np.empty(sums.shape[1:])
+    slopes = np.empty((2, sums.shape[1], 6))
+    per_point = x_0.size > 1
+    out[:] = 0.0
+    for star in range(x_0.size):
+        points = slice(star, star + 1) if per_point else slice(0, x.size)
+        match_rows(x_0[star], y_0[star], sums, x_grid, y_grid, rows, slopes)
+        for row in rows:
+            _add_values(x[points], y[points], x_0[star], y_0[star], row, 1.0,
+                        integrated, out[points])
+    for i in range(x.size):
+        out[i] *= flux[i if flux.size > 1 else 0]
+
+
+@_jit
+def differentiate_matched(x, y, x_0, y_0, sums, x_grid, y_grid, integrated,
+                          out):
+    """Put value and derivatives into out (3, n); as `differentiate_grid`."""
+    rows = np.empty(sums.shape[1:])
+    slopes = np.empty((2, sums.shape[1], 6))
+    match_rows(x_0, y_0, sums, x_grid, y_grid, rows, slopes)
+    out[:] = 0.0
+    for k in range(rows.shape[0]):
+        a, mx, my, p, s, q = rows[k]
+        for i in range(x.size):
+            dx, dy = x[i] - x_0 - mx, y[i] - y_0 - my
+            g = _value(dx, dy, p, s, q, integrated)
+            gx, gy = _gradient(dx, dy, p, s, q, integrated)
+            gxx, gxy, gyy = _hessian(dx, dy, p, s, q, integrated)
+            out[0, i] += a * g
+            for axis in range(2):
+                # The heat equation turns slopes of the covariance into
+                # second derivatives.
+                d = slopes[axis, k]
+                out[1 + axis, i] += a * (
+                    d[0] * g - d[1] * gx - d[2] * gy + 0.5 * d[3] * gxx
+                    + d[4] * gxy + 0.5 * d[5] * gyy)
+            out[1, i] -= a * gx
+            out[2, i] -= a * gy
+
+
+@_jit
+def render_matched(x, y, flux, left, bottom, sums, x_grid, y_grid,
+                   integrated, out):
+    """Add stars of matched Gaussians to stamps; as `render_grid`."""
+    rows = np.empty(sums.shape[1:])
+    slopes = np.empty((2, sums.shape[1], 6))
+    px, py = _pixel_positions(out.shape[1], out.shape[2])
+    for i in range(x.size):
+        match_rows(x[i], y[i], sums, x_grid, y_grid, rows, slopes)
+        _add_stamp(rows, x[i] - left[i], y[i] - bottom[i], flux[i],
+                   integrated, px, py, out[i])
 
 
 # Least-squares fits of a mixture to a stamp. Everything is in stamp pixels
