@@ -3,7 +3,7 @@ import copy
 
 import numpy as np
 from astropy.modeling import Fittable2DModel, Parameter
-from astropy.units import Quantity, UnitsError
+from astropy.units import Quantity, Unit, UnitsError
 
 from photutils_mgauss import _compat
 
@@ -32,6 +32,10 @@ class PSFModel(Fittable2DModel):
     flux = PSFParameter(default=1, description='Total flux of the star.')
     x_0 = PSFParameter(default=0, description='Position of the star in x.')
     y_0 = PSFParameter(default=0, description='Position of the star in y.')
+
+    # How files hold the parameters: column and unit.
+    _parameter_columns = {'name': '', 'value': '', 'unit': '', 'fixed': '',
+                          'lower': '', 'upper': ''}
 
     # In standard deviations of the widest Gaussian; 5.5 leaves out 3e-7 of
     # its flux.
@@ -113,6 +117,31 @@ class PSFModel(Fittable2DModel):
             raise UnitsError(msg)
         lengths = dict.fromkeys(self._length_names(), x_unit)
         return {**lengths, 'flux': outputs_unit[self.outputs[0]]}
+
+    def _parameter_table(self):
+        """Return the columns of a table of parameters; NaN is no bound."""
+        parameters = [getattr(self, name) for name in self.param_names]
+        bounds = np.array([p.bounds for p in parameters], dtype=float)
+        return {'name': list(self.param_names),
+                'value': np.array([p.value for p in parameters], float),
+                'unit': [str(p.unit or '') for p in parameters],
+                'fixed': [bool(p.fixed) for p in parameters],
+                'lower': bounds[:, 0], 'upper': bounds[:, 1]}
+
+    @staticmethod
+    def _parameter_keywords(table):
+        """Return the keywords that give a new model these parameters."""
+        names = [str(name) for name in table['name']]
+        bounds = np.column_stack([table['lower'], table['upper']])
+        values = {name: float(value) * Unit(unit) if unit else float(value)
+                  for name, value, unit in zip(
+                      names, table['value'], table['unit'], strict=True)}
+        return {**values,
+                'fixed': dict(zip(names, map(bool, table['fixed']),
+                                  strict=True)),
+                'bounds': {name: tuple(None if np.isnan(b) else float(b)
+                                       for b in pair)
+                           for name, pair in zip(names, bounds, strict=True)}}
 
     def _length_names(self):
         """Return the names of the parameters that are lengths."""
