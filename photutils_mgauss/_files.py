@@ -7,6 +7,7 @@ in columns, never in header cards, which would cost digits; so what is read
 is what was written, bit by bit. Nothing is pickled.
 """
 import warnings
+from io import BytesIO
 
 import numpy as np
 from astropy.io import fits, registry
@@ -234,6 +235,9 @@ def _stored_in_asdf(file):
     with enabled(), warnings.catch_warnings():
         # An unknown version of a tag is only a warning of asdf.
         warnings.simplefilter('error')
+        if hasattr(file, 'read'):
+            # asdf bypasses the buffer of files that others have looked into.
+            file = BytesIO(file.read())
         with asdf.open(file) as opened:
             return [value for value in opened.tree.values()
                     if type(value).__name__ in CLASSES]

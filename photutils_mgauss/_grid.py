@@ -325,13 +325,13 @@ def checked_arrays(x, y, weights, means, covariances, scales):
     ValueError
         If they are not mixtures on a rectangular grid in order.
     """
-    order, x_grid, y_grid = _lattice(np.column_stack([x, y]))
-    if not (order == np.arange(order.size)).all():
-        msg = 'nodes must be ordered by y, then x, got another order'
-        raise ValueError(msg)
     values = (x, y, weights, means, covariances, scales)
     if not all(np.isfinite(value).all() for value in values):
         msg = 'nodes must be finite, got NaN or infinity'
+        raise ValueError(msg)
+    order, x_grid, y_grid = _lattice(np.column_stack([x, y]))
+    if not (order == np.arange(order.size)).all():
+        msg = 'nodes must be ordered by y, then x, got another order'
         raise ValueError(msg)
     if not (np.abs(weights.sum(axis=1) - 1) < 1e-9).all():
         msg = 'weights must sum to 1 at every node'

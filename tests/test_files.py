@@ -191,7 +191,9 @@ def test_a_changed_byte_in_fits_is_noticed(tmp_path):
 def test_a_missing_column_is_named(tmp_path):
     make_grid().write(tmp_path / 'a.fits')
     with fits.open(tmp_path / 'a.fits') as hdus:
-        hdus['NODES'].columns.del_col('SCALE')
+        left = [column for column in hdus['NODES'].columns
+                if column.name != 'SCALE']
+        hdus['NODES'] = fits.BinTableHDU.from_columns(left, name='NODES')
         hdus.writeto(tmp_path / 'b.fits', checksum=True)
     with pytest.raises(ValueError, match="got none for 'scale' of 'nodes'"):
         GriddedMixturePSF.read(tmp_path / 'b.fits')
@@ -235,7 +237,7 @@ def test_asdf_finds_the_package_by_its_entry_points(tmp_path):
 import sys, asdf
 sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]
 asdf.open({str(tmp_path / 'b.asdf')!r}).close()
-heavy = {{'photutils', 'numba', 'scipy', 'photutils_mgauss.gridded'}}
+heavy = {{'photutils', 'numba', 'photutils_mgauss.gridded'}}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
 with asdf.open({str(tmp_path / 'a.asdf')!r}) as file:
     print(file['psf'])
