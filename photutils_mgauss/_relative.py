@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from photutils_mgauss._joint import scaled_rows, eliminate, parts, run
+from photutils_mgauss._joint import eliminate, parts, run, scaled_rows
 from photutils_mgauss._stacked import gram
 
 
