@@ -19,6 +19,10 @@ from photutils_mgauss.matching import (
     match_positions,
 )
 
+TRIALS = 300   # maps through a few stars that are tried for a plane
+FAR = 0.01     # of the field: how far a star may be from its place
+AGREED = 0.25  # least part of the stars that has to agree with a map
+
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
@@ -47,6 +51,8 @@ class Sightings:
     catalogue : `Catalogue` or None
     references : (k,) int `~numpy.ndarray`
         The star of each object of the catalogue, -1 where not seen.
+    agreed : (n,) bool `~numpy.ndarray`
+        Stars that lie where ``ties`` puts them, within a few residuals.
     """
 
     plane: TangentPlane | None
@@ -61,6 +67,7 @@ class Sightings:
     ties: list
     catalogue: Catalogue | None
     references: np.ndarray
+    agreed: np.ndarray
 
     @property
     def epoch_years(self):
@@ -342,7 +349,8 @@ def _stack(plane, unit, names, matches, detections, catalogue):
         plane, unit, names, matches, places,
         matches.take([one.covariance for one in detections]), years, usable,
         matches.take([one.flux for one in detections]),
-        [None] * len(detections), catalogue, np.empty(0, dtype=int))
+        [None] * len(detections), catalogue, np.empty(0, dtype=int),
+        np.ones(len(names), dtype=bool))
 
 
 def tie_planes(sightings, on_sky, transform):
@@ -356,20 +364,22 @@ def tie_planes(sightings, on_sky, transform):
         return sightings
     targets, known = _targets(sightings, on_sky)
     places, covariance = sightings.places.copy(), sightings.covariance.copy()
-    ties = list(sightings.ties)
+    ties, agreed = list(sightings.ties), sightings.agreed.copy()
     start = np.flatnonzero(on_sky)
     if not known and not len(start):
         targets = places[:, 0].copy()
     for e in np.flatnonzero(~np.asarray(on_sky)):
         aim = _at_epoch(sightings, targets, e) if known else targets
-        ties[e] = _tie(places[:, e], aim, sightings.usable[e], transform, e)
+        ties[e], far = _tie(places[:, e], aim, sightings.usable[e],
+                            transform, e)
+        agreed &= ~far
         slope = ties[e][:, 1:]
         places[:, e] = ties[e][:, :1] + slope @ places[:, e]
         covariance[:, e] = sandwich_2x2(slope[..., None], covariance[:, e])
         if not known:
             targets = np.where(np.isfinite(targets), targets, places[:, e])
     return replace(sightings, places=places, covariance=covariance,
-                   ties=ties)
+                   ties=ties, agreed=agreed)
 
 
 def _targets(sightings, on_sky):
@@ -404,20 +414,71 @@ def _at_epoch(sightings, targets, e):
 
 
 def _tie(points, targets, usable, transform, e):
-    """Fit the map of one plane onto its targets, without outliers."""
-    good = usable & np.isfinite(targets).all(axis=0)
-    for _ in range(8):
+    """Return the map of a plane onto its targets, and outliers (n,)."""
+    common = usable & np.isfinite(targets).all(axis=0)
+    good = common
+    for k in range(8):
         if good.sum() < transform.n_references:
             msg = (f'epoch {e} must have at least {transform.n_references} '
                    f'stars in common with the others for the transform '
                    f'{transform.kind!r}, got {good.sum()}')
             raise ValueError(msg)
-        tie = tie_plane(points[:, good], targets[:, good],
-                        np.ones(good.sum()), transform)
+        if k == 0:
+            tie = _most_agreed(points[:, common], targets[:, common],
+                               transform)
+        else:
+            tie = tie_plane(points[:, good], targets[:, good],
+                            np.ones(good.sum()), transform)
         residual = np.hypot(*(targets - tie[:, :1] - tie[:, 1:] @ points))
-        limit = 5 * np.median(residual[good])
-        keep = usable & (residual <= max(limit, 1e-9))
+        keep = common & (residual <= _limit(residual[good], k == 0))
         if (keep == good).all():
             break
         good = keep
-    return tie
+    # A star may move fast and still be itself: one in the wrong place by a
+    # part of the whole field is not.
+    extent = FAR * np.max(np.ptp(targets[:, common], axis=1))
+    if common.sum() > 3 and np.median(residual[good]) > 10 * extent > 0:
+        msg = (f'epoch {e} must agree with the others on which star is '
+               f'which, got {common.sum()} common stars that no map brings '
+               'together: are the identifiers those of the same stars?')
+        raise ValueError(msg)
+    return tie, common & (residual > max(
+        extent, 3 * _limit(residual[good], False)))
+
+
+def _limit(residuals, first):
+    """Return how far stars that belong to a tie may lie from it."""
+    if first:
+        return max(5 * np.quantile(residuals, AGREED), 1e-9)
+    return max(5 * np.median(residuals), 1e-9)
+
+
+def _most_agreed(points, targets, transform):
+    """
+    Return the map, of many through a few stars, most stars agree with.
+
+    Identifiers that are wrong for most of the stars, such as running numbers
+    of those without a name, do no harm as long as a quarter is right.
+    """
+    # Polynomials are tied by affine maps, which three stars make.
+    n, size = points.shape[1], min(transform.n_references, 3)
+    best = tie_plane(points, targets, np.ones(n), transform)
+    extent = FAR * np.max(np.ptp(targets, axis=1))
+    if n < 4 * size or _agreed(points, targets, best, 0.9) < extent:
+        return best
+    rng = np.random.default_rng(0)
+    least = _agreed(points, targets, best)
+    for _ in range(TRIALS):
+        some = rng.choice(n, size + 1, replace=False)
+        tie = tie_plane(points[:, some], targets[:, some],
+                        np.ones(len(some)), transform)
+        residual = _agreed(points, targets, tie)
+        if residual < least:
+            best, least = tie, residual
+    return best
+
+
+def _agreed(points, targets, tie, part=AGREED):
+    """Return the distance within which a part of the stars agrees."""
+    residual = targets - tie[:, :1] - tie[:, 1:] @ points
+    return np.quantile(np.hypot(*residual), part)

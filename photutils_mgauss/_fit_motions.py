@@ -122,10 +122,11 @@ def prepare(sightings, epochs, options):
                   np.nan_to_num(dt), observer, None, None, None, False,
                   None)
     scene = _with_references(scene)
-    _check_references(scene)
+    untied = _scattered(scene)
+    _check_references(scene, untied)
     maps = np.repeat(transform.identity()[None], len(dt), axis=0)
     return scene, State(maps, sightings.usable.copy(), _first_floor(scene),
-                        np.empty(0, dtype=int), _scattered(scene))
+                        np.empty(0, dtype=int), untied)
 
 
 def _scattered(scene):
@@ -143,7 +144,8 @@ def _scattered(scene):
     typical = spread[scene.anchors & (count > 1)]
     limit = 30 * np.median(typical) if len(typical) else 0.0
     baseline = np.ptp(scene.sightings.epoch_years)
-    return spread > max(limit, scene.options.max_motion * baseline)
+    scattered = spread > max(limit, scene.options.max_motion * baseline)
+    return scattered | ~scene.sightings.agreed
 
 
 def _check_parallax(options, observer):
@@ -252,12 +254,12 @@ def _first_floor(scene):
     return np.broadcast_to(floor**2, n_epochs).copy()
 
 
-def _check_references(scene):
+def _check_references(scene, untied):
     """Raise where an epoch has fewer references than its map needs."""
     need = scene.transform.n_references
     if scene.transform.kind == 'none':
         return
-    usable = scene.sightings.usable & scene.anchors
+    usable = scene.sightings.usable & scene.anchors & ~untied
     if scene.relative:
         usable = usable & (usable.sum(axis=0) > 1)
     counts = usable.sum(axis=1)
@@ -265,6 +267,8 @@ def _check_references(scene):
         e = int(np.argmin(counts))
         what = ('stars in common with other epochs' if scene.relative
                 else 'reference objects')
+        if (untied & scene.anchors).any():
+            what += ' whose places agree'
         msg = (f'epoch {e} must have at least {need} {what} for the '
                f'transform {scene.transform.kind!r}, got {counts[e]}')
         raise ValueError(msg)

@@ -240,6 +240,8 @@ class MotionSolution:
         catalogue says of each reference object: for comparing the two.
         """
         result = self._fit
+        if result.scene.relative:
+            return self.stars.copy()
         alone = replace(result.problem,
                         priors=Priors.none(result.problem.n_parameters))
         estimates = solve_all(alone, result.frames.correction,
