@@ -50,6 +50,7 @@ _OWNERS = {
     'MotionSolution': 'proper_motion',
     'ProperMotionFitter': 'proper_motion',
     'barycentric_observer': '_parallax',
+    'bootstrap_median': 'proper_motion',
     'decode_motion_flags': 'proper_motion',
     'invert_wcs': '_wcs_tools',
     'read_psfex': 'psf_io',
