@@ -31,6 +31,7 @@ _OWNERS = {
     'DetectorEffects': 'simulation',
     'Exposure': 'simulation',
     'Instrument': 'simulation',
+    'Optics': 'simulation',
     'Scene': 'simulation',
     'SimulatedCatalogue': 'simulation',
     'crowded_field': 'simulation',

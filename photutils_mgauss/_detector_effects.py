@@ -98,12 +98,6 @@ class DetectorEffects:
                    bad_columns=1, cosmic_rays=1.5, nonlinearity=0.005,
                    bleeding=True, charge_diffusion=0.2)
 
-    def widen(self, psf):
-        """Return the PSF with the diffusion of charge in it."""
-        if self.charge_diffusion == 0:
-            return psf
-        return psf.convolve(self.charge_diffusion**2 * np.eye(2))
-
 
 @dataclass(frozen=True, eq=False)
 class Pattern:

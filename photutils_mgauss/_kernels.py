@@ -1148,3 +1148,62 @@ def bleed(columns, full_well):
                 else:
                     column[j] += carried
                     carried = 0.0
+
+
+@_jit
+def _spline_taps(t, taps):
+    """Put the cubic B-spline at 1 + t, t, 1 - t and 2 - t into taps (4,)."""
+    taps[0] = (1 - t) ** 3 / 6
+    taps[1] = (4 + t * t * (3 * t - 6)) / 6
+    taps[3] = t ** 3 / 6
+    taps[2] = 1 - taps[0] - taps[1] - taps[3]
+
+
+@_jit
+def _add_epsf(image, share, x, y, reach, oversampling, wx, wy, out):
+    """Add a star at (x, y) of out, from the spline of an ePSF image."""
+    low_y = max(0, ceil(y - reach))
+    high_y = min(out.shape[0] - 1, floor(y + reach))
+    low_x = max(0, ceil(x - reach))
+    high_x = min(out.shape[1] - 1, floor(x + reach))
+    # All pixels of a star fall on the same fraction of the fine lattice.
+    step = int(oversampling)
+    v = (low_y - y) * oversampling + 0.5 * (image.shape[0] - 1)
+    u = (low_x - x) * oversampling + 0.5 * (image.shape[1] - 1)
+    row, column = int(floor(v)), int(floor(u))
+    _spline_taps(v - row, wy)
+    _spline_taps(u - column, wx)
+    for j in range(low_y, high_y + 1):
+        m = row - 1 + (j - low_y) * step
+        for i in range(low_x, high_x + 1):
+            n = column - 1 + (i - low_x) * step
+            total = 0.0
+            for b in range(4):
+                line = (wx[0] * image[m + b, n] + wx[1] * image[m + b, n + 1]
+                        + wx[2] * image[m + b, n + 2]
+                        + wx[3] * image[m + b, n + 3])
+                total += wy[b] * line
+            out[j, i] += share * total
+
+
+@_jit
+def render_epsfs(x, y, flux, reach, images, x_grid, y_grid, oversampling,
+                 left, bottom, out):
+    """
+    Add stars (n,) made of ePSF images to out, in the order given.
+
+    images (M, ny, nx) are coefficients of cubic splines, ordered as nodes of
+    `render_image` are; reach (n,) is half the side of the square a star
+    fills [pix], at least one pixel less than that of the images.
+    """
+    index = np.empty(4, np.int64)
+    weights = np.empty((3, 4))
+    wx = np.empty(4)
+    wy = np.empty(4)
+    for i in range(x.size):
+        blend_weights(x[i], y[i], x_grid, y_grid, index, weights)
+        for corner in range(4):
+            share = weights[0, corner] * flux[i]
+            if share != 0:
+                _add_epsf(images[index[corner]], share, x[i] - left,
+                          y[i] - bottom, reach[i], oversampling, wx, wy, out)
