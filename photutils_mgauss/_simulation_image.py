@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 
+from photutils_mgauss._brighter_fatter import shoot_stars
 from photutils_mgauss._detector_effects import (
     SATURATED,
     DetectorEffects,
@@ -112,11 +113,16 @@ def expose(chip, truth, psf, rng, executor):
     brush = brush_of(psf)
     electrons = np.empty(chip.instrument.shape, np.float32)
     flags = np.empty(chip.instrument.shape, np.uint8)
+    repel = chip.effects.brighter_fatter
+    stars = _split(brush, x, y, 0 * flux if repel else flux, chip.bands,
+                   FAINTEST)
     parts = _run(partial(_expose_band, chip, brush), executor, chip.bands,
-                 _split(brush, x, y, flux, chip.bands, FAINTEST),
-                 rng.spawn(len(chip.bands)))
+                 stars, rng.spawn(len(chip.bands)))
     for band, part in zip(chip.bands, parts, strict=True):
         electrons[band], flags[band] = part
+    if repel:
+        electrons += shoot_stars(psf, x, y, flux, chip.instrument.shape,
+                                 repel, rng)
     add_cosmic_rays(electrons, flags, chip.effects,
                     chip.instrument.exposure_time, rng)
     full_well = chip.instrument.full_well

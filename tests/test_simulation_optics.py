@@ -7,11 +7,14 @@ from numpy.testing import assert_allclose
 from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF
+from photutils_mgauss._brighter_fatter import photons
 from photutils_mgauss._simulation_brush import widen
 from photutils_mgauss.simulation import (
+    DetectorEffects,
     Exposure,
     Instrument,
     Optics,
+    csst_psf,
     render_stars,
     simulate,
     simulate_catalogues,
@@ -141,3 +144,43 @@ def test_unequal_oversampling_is_refused():
         'oversampling': (2, 4)}))
     with pytest.raises(ValueError, match='the same oversampling'):
         render_stars(psf, [1], [1], [1], (9, 9))
+
+
+# The brighter-fatter effect.
+
+def moment_of_star(flux, strength):
+    camera = Instrument(shape=(41, 41), read_noise=0.0, dark=0.0,
+                        full_well=1e7, exposure_time=1e-3)
+    stars = QTable({'x': [20.0], 'y': [20.0], 'flux': [flux]})
+    psf = csst_psf((41, 41), variation=0)
+    scene = simulate(stars, instrument=camera, psf=psf, rng=1,
+                     effects=DetectorEffects(brighter_fatter=strength))
+    y, x = np.mgrid[-20:21, -20:21]
+    weight = scene.image * np.exp(-(x**2 + y**2) / 8)
+    return scene, (weight * (x**2 + y**2)).sum() / weight.sum()
+
+
+def test_bright_stars_are_wider_where_charge_repels():
+    pytest.importorskip('galsim')
+    bright, width = moment_of_star(2e6, 1.0)
+    _, without = moment_of_star(2e6, 0.0)
+    _, faint = moment_of_star(2e5, 1.0)
+    assert width > 1.008 * without
+    assert abs(faint / without - 1) < 0.5 * abs(width / without - 1)
+    assert abs(bright.image.sum() / 2e6 - 1) < 0.01
+
+
+def test_photons_have_the_moments_of_the_mixture(mixture_psf, rng):
+    mixture = mixture_psf.mixture_at(40, 60)
+    places = photons(mixture, 100_000, rng)
+    mean, covariance = mixture.moments()
+    assert_allclose(places.mean(axis=1), mean, atol=0.02)
+    assert_allclose(np.cov(places), covariance, atol=0.05)
+
+
+def test_repulsion_needs_mixtures_before_the_pixel(mixture_psf):
+    stars = QTable({'x': [20.0], 'y': [20.0], 'flux': [100.0]})
+    with pytest.raises(ValueError, match='pixel_integrated=True'):
+        simulate(stars, instrument=Instrument(shape=(41, 41)), rng=1,
+                 psf=mixture_psf,
+                 effects=DetectorEffects(brighter_fatter=1.0))
