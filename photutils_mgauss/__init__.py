@@ -23,8 +23,12 @@ except ImportError:  # a source tree that was never installed
 # Public name -> the module that owns it.
 _OWNERS = {
     'GriddedMixturePSF': 'gridded',
+    'MixtureField': 'field',
+    'fit_mixture_field': 'field',
+    'select_psf_stars': 'selection',
     'MultiGaussianPSFModel': 'model',
     'GaussianMixture': 'mixture',
+    'PSFExModel': 'psf_io',
     'blend': 'mixture',
     'CSST_BANDS': 'simulation',
     'Band': 'simulation',
@@ -43,9 +47,21 @@ _OWNERS = {
     'simulate_epochs': 'simulation',
     'sky_field': 'simulation',
     'sparse_field': 'simulation',
+    'Epoch': 'proper_motion',
+    'MotionSolution': 'proper_motion',
+    'ProperMotionFitter': 'proper_motion',
+    'barycentric_observer': '_parallax',
+    'decode_motion_flags': 'proper_motion',
+    'invert_wcs': '_wcs_tools',
+    'read_psfex': 'psf_io',
+    'adaptive_moments': 'shapes',
     'FitStatus': 'fitting',
     'MixtureFit': 'fitting',
+    'Shapes': 'shapes',
+    'ShapeStatus': 'shapes',
     'fit_mixture': 'fitting',
+    'MixtureFitter': 'fitter',
+    'MixturePSFPhotometry': 'photometry',
 }
 
 __all__ = ['__version__', *_OWNERS]

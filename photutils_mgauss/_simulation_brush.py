@@ -46,9 +46,12 @@ class MixtureBrush:
         """Add stars (3, n), the rows x, y and flux, to out (ny, nx)."""
         x, y, flux = np.ascontiguousarray(stars)
         grid = self.psf._grid
-        _kernels.render_image(x, y, flux, grid.rows, grid.x_grid, grid.y_grid,
-                              self.psf.pixel_integrated, faintest,
-                              float(left), float(bottom), out)
+        kernel, nodes = ((_kernels.render_image, grid.rows)
+                         if self.psf.interpolation == 'blend' else
+                         (_kernels.render_matched_image, grid.sums))
+        kernel(x, y, flux, nodes, grid.x_grid, grid.y_grid,
+               self.psf.pixel_integrated, float(faintest), float(left),
+               float(bottom), out)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,22 @@ pixels of a PSF of unit flux sum to :math:`s_x s_y`, as in photutils.
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
 from photutils_mgauss import _kernels
 from photutils_mgauss._parallel import map_chunks
+from photutils_mgauss._stamps import (
+    Problem,
+    Stamp,
+    Workspace,
+    covariance_of,
+    mixture_of,
+    narrow_first,
+    run,
+    search,
+    shapes_of,
+)
 from photutils_mgauss._validation import (
     as_choice,
     as_floats,
@@ -26,21 +36,9 @@ from photutils_mgauss.mixture import GaussianMixture
 
 __all__ = ['FitStatus', 'MixtureFit', 'fit_mixture']
 
-_TOLERANCE = 1e-8
-_MAX_STEPS = 500
-# How many steps every start gets before the best one goes on alone.
-_FIRST_STEPS = 15
-# A Gaussian narrower than this in stamp pixels falls between the pixel
-# centres and can take any flux.
-_MIN_STDDEV = 0.4
-# How firmly the total flux is tied and limits are kept, in units of the
-# power of the image.
-_TIE = 1e6
-_STIFFNESS = 1.0
-
 
 class FitStatus(IntEnum):
-    """How a fit ended; `sentence` says it in words."""
+    """How a fit ended; ``sentence`` says it in words."""
 
     CONVERGED = 0
     STOPPED = 1
@@ -225,13 +223,13 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
     array([0.8, 0.2])
     """
     images = as_floats(image, 'image', finite=False)
-    if images.ndim not in (2, 3):
-        msg = ('image must have shape (ny, nx) or (n, ny, nx), got '
-               f'{images.shape}')
+    if images.ndim not in (2, 3) or 0 in images.shape:
+        msg = ('image must have shape (ny, nx) or (n, ny, nx) and pixels, '
+               f'got {images.shape}')
         raise ValueError(msg)
     single = images.ndim == 2
     images = images.reshape(-1, *images.shape[-2:])
-    problem = _Problem(
+    problem = Problem(
         n_components=as_integer(n_components, 'n_components', minimum=1),
         oversampling=as_shape(oversampling, 'oversampling'),
         origin=_as_origin(origin, images.shape[1:]),
@@ -255,30 +253,6 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
 
 
 # Checks of arguments.
-
-class _Problem(NamedTuple):
-    """What is asked of every image of a stack."""
-
-    n_components: int
-    oversampling: tuple
-    origin: np.ndarray
-    radius: float | None
-    enclosed_flux: float | None
-    tied: bool
-    signed: bool
-    fixed: bool
-    has_error: bool
-
-    @property
-    def pitch(self):
-        """Image pixels per native pixel along (x, y)."""
-        return np.array(self.oversampling[::-1], float)
-
-    @property
-    def n_parameters(self):
-        per_gaussian = 4 if self.fixed else 6
-        return self.n_components * per_gaussian - self.tied
-
 
 def _optional(value, name, **limits):
     return None if value is None else as_real(value, name, **limits)
@@ -343,74 +317,9 @@ def _as_starts(start, n, problem):
 
 # The fit of one stamp.
 
-class Workspace:
-    """
-    The memory in which kernels fit K Gaussians to stamps of one shape.
-
-    Parameters
-    ----------
-    n_components : int
-        The number K of Gaussians.
-    shape : (ny, nx) tuple of int
-        The shape of the stamps.
-    """
-
-    def __init__(self, n_components, shape):
-        k, n = n_components, 6 * n_components
-        self.scratch = (
-            np.empty((k, *shape)), np.empty(shape), np.empty((k, k)),
-            np.empty(k), np.empty((k, k + 1)), np.empty(k, bool),
-            np.empty((k, 6, 6)), np.empty((5, 5)), np.empty(6),
-            np.empty((6, 6)))
-        self.matrices = np.empty((n, n)), np.empty((n, n))
-        self.vectors = (np.empty(n), np.empty(n), np.empty((k, 5)),
-                        np.empty(k))
-
-
-class _Stamp(NamedTuple):
-    """
-    One image, scaled for the kernels.
-
-    ``pixels`` have a peak of 1 and ``weight`` makes their power 1: pixel
-    unit ``scale`` and weight unit ``weight_unit``. ``tie`` and ``limits`` are
-    the kernels'.
-    """
-
-    pixels: np.ndarray
-    weight: np.ndarray
-    centre: np.ndarray
-    tie: tuple
-    limits: np.ndarray
-    scale: float
-    weight_unit: float
-
-    @classmethod
-    def prepare(cls, image, weight, peak, problem):
-        used = weight > 0
-        pixels = np.where(used, image, 0.0)
-        scale = pixels.max()
-        pixels /= scale
-        weight_unit = (weight * pixels**2).sum()
-        centre = problem.origin if problem.fixed else np.rint(peak)
-        total = pixels.sum()
-        tie = (total, _TIE / total**2) if problem.tied else (0.0, 0.0)
-        reach = _reach(used, centre)
-        limits = np.array([np.log(_MIN_STDDEV), np.log(reach.max()), *reach,
-                           _STIFFNESS])
-        return cls(pixels, weight / weight_unit, centre, tie, limits, scale,
-                   weight_unit)
-
-
-def _reach(used, centre):
-    """Return how far used pixels are from the centre along x and y."""
-    j, i = np.nonzero(used)
-    return np.array([np.abs(i - centre[0]).max() + 1,
-                     np.abs(j - centre[1]).max() + 1])
-
-
 def _fit_stack(problem, images, weights, starts):
     shape = images.shape[1:]
-    spaces = {k: Workspace(k, shape) for k in {1, problem.n_components}}
+    spaces = [Workspace(k, shape) for k in range(problem.n_components + 1)]
     return [_fit_image(problem, spaces, *item)
             for item in zip(images, weights, starts, strict=True)]
 
@@ -419,15 +328,15 @@ def _fit_image(problem, spaces, image, weight, start):
     status, weight, peak = _select(problem, image, weight)
     if status is not None:
         return _failure(status, image)
-    stamp = _Stamp.prepare(image, weight, peak, problem)
+    stamp = Stamp.prepare(image, weight, peak, problem)
     if start is None:
-        shapes = _search(stamp, problem, spaces)
+        solution = search(stamp, problem, spaces)
     else:
-        shapes = _shapes_of(start, problem, stamp.centre)
-    solution = _run(stamp, problem, spaces, shapes, _MAX_STEPS)
+        solution = run(stamp, problem, spaces,
+                       shapes_of(start, problem, stamp.centre))
     if not solution.fluxes.sum() > 0:
         return _failure(FitStatus.EMPTY, image)
-    return _report(problem, stamp, image, _sorted(solution),
+    return _report(problem, stamp, image, narrow_first(solution),
                    spaces[problem.n_components])
 
 
@@ -493,100 +402,13 @@ def _inside(problem, pixels, peak):
     return distance <= radius
 
 
-class _Solution(NamedTuple):
-    """The kernels' answer, in stamp pixels."""
-
-    shapes: np.ndarray
-    fluxes: np.ndarray
-    cost: float
-    stopped: bool
-
-
-def _run(stamp, problem, spaces, shapes, max_steps):
-    """Return what Levenberg-Marquardt makes of a start (K, 5)."""
-    shapes = shapes.copy()
-    fluxes = np.empty(len(shapes))
-    space = spaces[len(shapes)]
-    cost, status, _ = _kernels.fit_shapes(
-        stamp.pixels, stamp.weight, stamp.centre, shapes, fluxes, stamp.tie,
-        problem.signed, problem.fixed, stamp.limits, _TOLERANCE, max_steps,
-        space.scratch, space.matrices, space.vectors)
-    return _Solution(shapes, fluxes, cost, status == _kernels.FIT_STOPPED)
-
-
-# Starts.
-
-def _search(stamp, problem, spaces):
-    """Return the shapes of the best of several short fits."""
-    first = _run(stamp, problem, spaces, _core(stamp, problem), _MAX_STEPS)
-    if problem.n_components == 1:
-        return first.shapes
-    trials = [_run(stamp, problem, spaces, _dress(start, first.shapes[0],
-                                                  problem.fixed),
-                   _FIRST_STEPS)
-              for start in _templates(problem.n_components)]
-    return min(trials, key=lambda trial: trial.cost).shapes
-
-
-def _core(stamp, problem):
-    """Return a round Gaussian with the peak's position and half-width."""
-    above = np.count_nonzero(stamp.pixels > 0.5)
-    stddev = max(np.sqrt(above / np.pi / (2 * np.log(2))), _MIN_STDDEV)
-    mean = np.zeros(2)
-    if not problem.fixed:
-        mean = _find_peak(stamp.pixels) - stamp.centre
-    return np.array([[*mean, -np.log(stddev), 0, -np.log(stddev)]])
-
-
-def _templates(n):
-    """
-    Yield starts (n, 5) relative to the Gaussian fitted alone.
-
-    Widths are in geometric progression between several pairs of limits, means
-    are on a small spiral so that no two Gaussians are alike.
-    """
-    angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
-    for narrow, wide, offset in ((0.8, 3.0, 0.1), (0.7, 6.0, 0.1),
-                                 (0.6, 1.8, 0.3), (0.9, 2.0, 0.8)):
-        widths = np.geomspace(narrow, wide, n)
-        yield np.column_stack([offset * np.cos(angle), offset * np.sin(angle),
-                               -np.log(widths), np.zeros(n), -np.log(widths)])
-
-
-def _dress(template, core, fixed):
-    """Return a start in the frame in which the core is a unit circle."""
-    x, y, log_l, t, log_m = core
-    length, m = np.exp(log_l), np.exp(log_m)
-    dx, dy, log_a, shear, log_b = template.T
-    dy = dy / m
-    dx = (dx - t * dy) / length
-    if fixed:
-        dx = dy = np.zeros(len(template))
-    return np.column_stack([x + dx, y + dy, log_a + log_l,
-                            np.exp(log_a) * t + shear * m, log_b + log_m])
-
-
-def _shapes_of(mixture, problem, centre):
-    """Return the shapes (K, 5) of a mixture in stamp pixels."""
-    pitch = problem.pitch
-    means = mixture.means * pitch + problem.origin - centre
-    if problem.fixed:
-        means = np.zeros_like(means)
-    covariances = mixture.covariances * pitch * pitch[:, None]
-    sxx, sxy, syy = (covariances[:, 0, 0], covariances[:, 0, 1],
-                     covariances[:, 1, 1])
-    length = np.sqrt(syy / (sxx * syy - sxy**2))
-    return np.column_stack([means, np.log(length), -length * sxy / syy,
-                            -0.5 * np.log(syy)])
-
-
 # From the solution to the result.
 
 def _report(problem, stamp, image, solution, space):
     """Return the MixtureFit of a solution, narrow Gaussians first."""
     area = np.prod(problem.pitch)
     total = stamp.tie[0] if problem.tied else solution.fluxes.sum()
-    mixture = _mixture_of(solution, problem, stamp.centre)
+    mixture = mixture_of(solution, problem, stamp.centre)
     images = space.scratch[0]
     _kernels.draw_unit(solution.shapes, *stamp.centre, images)
     model = np.tensordot(mixture.weights, images, 1)
@@ -595,7 +417,7 @@ def _report(problem, stamp, image, solution, space):
     n = np.count_nonzero(used)
     weight = stamp.weight[used] * stamp.weight_unit
     chi2 = float((weight * residual[used] ** 2).sum())
-    covariance = _covariance(problem, stamp, solution, space)
+    covariance = covariance_of(problem, stamp, solution, space)
     if not problem.has_error:
         covariance *= chi2 / max(n - problem.n_parameters, 1)
     status = _judge(solution, stamp)
@@ -603,26 +425,6 @@ def _report(problem, stamp, image, solution, space):
         mixture, status, status.sentence, float(stamp.scale * total / area),
         chi2, _bic(chi2, n, problem), float(model[used].sum()), residual,
         covariance)
-
-
-def _sorted(solution):
-    """Return the solution with narrow Gaussians first."""
-    order = np.argsort(-solution.shapes[:, 2] - solution.shapes[:, 4],
-                       kind='stable')
-    return solution._replace(shapes=solution.shapes[order],
-                             fluxes=solution.fluxes[order])
-
-
-def _mixture_of(solution, problem, centre):
-    pitch = problem.pitch
-    x, y, log_l, t, log_m = solution.shapes.T
-    length, m = np.exp(log_l), np.exp(log_m)
-    norm = np.hypot(t, m)
-    stddevs = np.column_stack([norm / (length * m), 1 / m]) / pitch
-    means = (np.column_stack([x, y]) + centre - problem.origin) / pitch
-    fluxes = solution.fluxes
-    return GaussianMixture.from_stddevs(fluxes / fluxes.sum(), means, stddevs,
-                                        -t / norm)
 
 
 def _judge(solution, stamp):
@@ -643,54 +445,3 @@ def _bic(chi2, n, problem):
     return float(n * np.log(max(chi2, np.finfo(float).tiny) / n) + size)
 
 
-def _covariance(problem, stamp, solution, space):
-    """
-    Return the covariance (6K, 6K) of the parameters users see.
-
-    It is the inverse of the normal matrix, for the Gaussians that have flux
-    and the parameters that are free.
-    """
-    n = problem.n_components
-    matrix, gradient = np.empty((6 * n, 6 * n)), np.empty(6 * n)
-    _kernels.project(stamp.pixels, stamp.weight, stamp.centre,
-                     solution.shapes, stamp.tie, problem.signed,
-                     solution.fluxes.copy(), space.scratch)
-    _kernels.normal_equations(
-        stamp.weight, stamp.centre, solution.shapes, solution.fluxes,
-        stamp.tie, space.scratch, matrix, gradient)
-    _kernels.add_penalties(solution.shapes, stamp.limits, matrix, gradient)
-    # From fluxes first to Gaussian by Gaussian.
-    place = np.column_stack([np.arange(n),
-                             np.arange(n, 6 * n).reshape(n, 5)]).ravel()
-    free = np.repeat(solution.fluxes != 0, 6)
-    if problem.fixed:
-        free &= np.tile([True, False, False, True, True, True], n)
-    chosen = np.ix_(place[free], place[free])
-    slopes = _slopes(solution, problem, stamp)[:, free]
-    inverse = np.linalg.pinv(matrix[chosen], rcond=1e-15, hermitian=True)
-    covariance = slopes @ inverse @ slopes.T / stamp.weight_unit
-    unknown = np.repeat(solution.fluxes == 0, 6)
-    covariance[unknown] = covariance[:, unknown] = np.nan
-    return covariance
-
-
-def _slopes(solution, problem, stamp):
-    """Return d(what users see) / d(what is fitted), (6K, 6K)."""
-    pitch = problem.pitch
-    _, _, log_l, t, log_m = solution.shapes.T
-    length, m = np.exp(log_l), np.exp(log_m)
-    square = t**2 + m**2
-    wide, high = np.sqrt(square) / (length * m) / pitch[0], 1 / m / pitch[1]
-    n = len(t)
-    blocks = np.zeros((n, 6, 6))
-    blocks[:, 0, 0] = stamp.scale / pitch.prod()
-    blocks[:, [1, 2], [1, 2]] = 1 / pitch
-    blocks[:, 3, 3] = -wide
-    blocks[:, 3, 4] = wide * t / square
-    blocks[:, 3, 5] = -wide * t**2 / square
-    blocks[:, 4, 5] = -high
-    blocks[:, 5, 4] = -(m**2) / square**1.5
-    blocks[:, 5, 5] = t * m**2 / square**1.5
-    slopes = np.zeros((n, 6, n, 6))
-    slopes[np.arange(n), :, np.arange(n)] = blocks
-    return slopes.reshape(6 * n, 6 * n)
