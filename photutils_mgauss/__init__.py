@@ -35,6 +35,7 @@ _OWNERS = {
     'DetectorEffects': 'simulation',
     'Exposure': 'simulation',
     'Instrument': 'simulation',
+    'Optics': 'simulation',
     'Scene': 'simulation',
     'SimulatedCatalogue': 'simulation',
     'crowded_field': 'simulation',
