@@ -113,6 +113,8 @@ class MixtureFit:
         in turn, in the image's flux unit and native pixels. Without errors
         it is scaled by chi2 over the degrees of freedom. NaN for a Gaussian
         without flux.
+    used : (ny, nx) `~numpy.ndarray` of bool
+        The pixels that were used.
     """
 
     mixture: GaussianMixture
@@ -124,6 +126,7 @@ class MixtureFit:
     enclosed_flux: float
     residual: np.ndarray
     covariance: np.ndarray
+    used: np.ndarray
 
     def __repr__(self):
         n = self.mixture.n_components if self.mixture else 0
@@ -343,7 +346,7 @@ def _fit_image(problem, spaces, image, weight, start):
 def _failure(status, image):
     nan = float('nan')
     return MixtureFit(None, status, status.sentence, nan, nan, nan, nan,
-                      np.full(image.shape, nan), None)
+                      np.full(image.shape, nan), None, None)
 
 
 def _select(problem, image, weight):
@@ -424,7 +427,7 @@ def _report(problem, stamp, image, solution, space):
     return MixtureFit(
         mixture, status, status.sentence, float(stamp.scale * total / area),
         chi2, _bic(chi2, n, problem), float(model[used].sum()), residual,
-        covariance)
+        covariance, used)
 
 
 def _judge(solution, stamp):
