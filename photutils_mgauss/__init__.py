@@ -27,11 +27,15 @@ _OWNERS = {
     'GaussianMixture': 'mixture',
     'blend': 'mixture',
     'adaptive_moments': 'shapes',
+    'compare_n_components': 'selection',
     'FitStatus': 'fitting',
     'MixtureFit': 'fitting',
     'Shapes': 'shapes',
     'ShapeStatus': 'shapes',
     'fit_mixture': 'fitting',
+    'MixturePosterior': 'sampling',
+    'sample_mixture': 'sampling',
+    'select_n_components': 'selection',
 }
 
 __all__ = ['__version__', *_OWNERS]

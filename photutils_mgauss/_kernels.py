@@ -769,12 +769,14 @@ def _residual(stamp, images, fluxes, out):
 
 
 @_jit
-def project(stamp, weight, centre, shapes, tie, signed, fluxes, scratch):
+def project(stamp, weight, centre, shapes, tie, signed, rows, fluxes,
+            scratch):
     """
     Put the best fluxes for the shapes into fluxes; return the chi square.
 
-    tie is the total flux and the weight of that condition (0: free). The
-    images and the residual are left in scratch.
+    tie is the total flux and the weight of that condition (0: free). rows
+    (m, ny, nx) are sums over the residual whose squares count too; m may be
+    0. The images and the residual are left in scratch.
     """
     images, residual, gram, rhs, work, active = scratch[:6]
     total, tie_weight = tie
@@ -785,11 +787,81 @@ def project(stamp, weight, centre, shapes, tie, signed, fluxes, scratch):
         for other in range(k + 1):
             dot = _weighted_dot(images[k], images[other], weight) + tie_weight
             gram[k, other] = gram[other, k] = dot
+    if rows.shape[0] > 0:
+        _add_rows_to_fluxes(rows, stamp, images, gram, rhs)
     _solve_fluxes(gram, rhs, signed, fluxes, active, work)
     _residual(stamp, images, fluxes, residual)
     chi2 = _weighted_dot(residual, residual, weight)
+    for row in rows:
+        chi2 += _dot(row, residual) ** 2
     lack = fluxes.sum() - total
     return chi2 + tie_weight * lack * lack
+
+
+@_jit
+def _dot(a, b):
+    """Return sum_pixels a b."""
+    total = 0.0
+    for j in range(a.shape[0]):
+        for i in range(a.shape[1]):
+            total += a[j, i] * b[j, i]
+    return total
+
+
+@_jit
+def _add_rows_to_fluxes(rows, stamp, images, gram, rhs):
+    """Add rows (m, ny, nx) over the residual to the equations of fluxes."""
+    seen = np.empty(images.shape[0])
+    for row in rows:
+        want = _dot(row, stamp)
+        for k in range(seen.size):
+            seen[k] = _dot(row, images[k])
+        for k in range(seen.size):
+            rhs[k] += seen[k] * want
+            for other in range(seen.size):
+                gram[k, other] += seen[k] * seen[other]
+
+
+@_jit
+def _add_rows(rows, centre, residual, images, fluxes, polynomials, matrix,
+              gradient):
+    """Add rows (m, ny, nx) over the residual to the normal equations."""
+    n = fluxes.size
+    sums, slopes = np.empty(6), np.empty(6 * n)
+    for row in rows:
+        left = _dot(row, residual)
+        for k in range(n):
+            _row_moments(row, images[k], centre, sums)
+            for i in range(6):
+                slope = 0.0
+                for a in range(6):
+                    slope += polynomials[k, i, a] * sums[a]
+                slopes[_unknown(n, k, i)] = slope * (fluxes[k] if i else 1.0)
+        for i in range(6 * n):
+            gradient[i] += slopes[i] * left
+            for j in range(6 * n):
+                matrix[i, j] += slopes[i] * slopes[j]
+
+
+@_jit
+def _row_moments(row, image, centre, sums):
+    """Put sum_pixels row image (1, x, y, xx, xy, yy) into sums (6,)."""
+    sums[:] = 0.0
+    for j in range(image.shape[0]):
+        s0, s1, s2 = 0.0, 0.0, 0.0
+        for i in range(image.shape[1]):
+            h = row[j, i] * image[j, i]
+            x = i - centre[0]
+            s0 += h
+            s1 += h * x
+            s2 += h * x * x
+        y = j - centre[1]
+        sums[0] += s0
+        sums[1] += s1
+        sums[2] += y * s0
+        sums[3] += s2
+        sums[4] += y * s1
+        sums[5] += y * y * s0
 
 
 @_jit
@@ -809,8 +881,8 @@ def _weighted_dot(a, b, weight):
 
 
 @_jit
-def normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
-                      gradient):
+def normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
+                     matrix, gradient):
     """
     Put the normal equations into matrix (6K, 6K) and gradient (6K,).
 
@@ -839,6 +911,9 @@ def normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
             _place(block, k, other, fluxes, matrix)
             matrix[k, other] += tie[1]
             matrix[other, k] = matrix[k, other]
+    if rows.shape[0] > 0:
+        _add_rows(rows, centre, residual, images, fluxes, polynomials, matrix,
+                  gradient)
 
 
 @_jit
@@ -934,7 +1009,7 @@ def _move(shapes, step, out):
 
 
 @_jit
-def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
+def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed, rows,
                fixed_means, limits, tolerance, max_steps, scratch, matrices,
                vectors):
     """
@@ -951,8 +1026,12 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
         Where to start (the fluxes are only written), and the result.
     tie : (2,)
         The total flux and the weight of that condition (0: free).
-    signed, fixed_means : bool
-        Whether fluxes may be negative; whether means stay as they are.
+    signed : bool
+        Whether fluxes may be negative.
+    rows : (m, ny, nx)
+        Sums over the residual whose squares are part of the cost.
+    fixed_means : bool
+        Whether means stay as they are.
     limits : (5,)
         See `penalty`.
     tolerance, max_steps
@@ -968,18 +1047,18 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
     matrix, factor = matrices
     gradient, step, trial, trial_fluxes = vectors
     idle_matrix, idle_gradient = factor, step
-    cost = project(stamp, weight, centre, shapes, tie, signed, fluxes,
-                    scratch)
-    normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
-                      gradient)
+    cost = project(stamp, weight, centre, shapes, tie, signed, rows, fluxes,
+                   scratch)
+    normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
+                     matrix, gradient)
     cost += add_penalties(shapes, limits, matrix, gradient)
     damping, growth, small = 1e-2, 2.0, 0
     for n_steps in range(1, max_steps + 1):
         gain = _step(matrix, gradient, fluxes, damping, fixed_means, factor,
                      step)
         _move(shapes, step, trial)
-        trial_cost = project(stamp, weight, centre, trial, tie, signed,
-                              trial_fluxes, scratch)
+        trial_cost = project(stamp, weight, centre, trial, tie, signed, rows,
+                             trial_fluxes, scratch)
         trial_cost += add_penalties(trial, limits, idle_matrix,
                                      idle_gradient)
         if not trial_cost < cost:
@@ -991,8 +1070,8 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
         drop = cost - trial_cost
         shapes[:] = trial
         fluxes[:] = trial_fluxes
-        normal_equations(weight, centre, shapes, fluxes, tie, scratch,
-                          matrix, gradient)
+        normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
+                         matrix, gradient)
         add_penalties(shapes, limits, matrix, gradient)
         small = small + 1 if drop <= tolerance * cost else 0
         cost = trial_cost

@@ -273,7 +273,7 @@ class _Data(NamedTuple):
 
     @classmethod
     def prepare(cls, image, fit, prior, unit, options):
-        x, y, centre, pitch = _lattice(image, options)
+        x, y, centre = _lattice(image, options)
         scale = fit.flux * unit**2
         used = fit.used
         values = np.asarray(image, float)[used] / scale
@@ -305,7 +305,7 @@ class _Data(NamedTuple):
 
 
 def _lattice(image, options):
-    """Return x and y [pix] of the pixels, the stamp's centre, the pitch."""
+    """Return x and y of the pixels, and the stamp's centre [pix]."""
     shape = np.shape(image)
     oversampling = np.broadcast_to(options.get('oversampling', 1), 2)
     pitch = np.array(oversampling[::-1], float)
@@ -314,7 +314,7 @@ def _lattice(image, options):
     origin = middle if origin is None else np.asarray(origin, float)
     y, x = np.indices(shape)
     return ((x - origin[0]) / pitch[0], (y - origin[1]) / pitch[1],
-            (middle - origin) / pitch, pitch)
+            (middle - origin) / pitch)
 
 
 def _whiten(fit, unit, tied, alpha_width):
@@ -365,10 +365,12 @@ def _build(data):
     import pytensor.tensor as pt
 
     with pm.Model() as model:
-        z = pm.Flat('z', shape=data.spread.shape[1] + 1,
-                    initval=np.zeros(data.spread.shape[1] + 1))
-        u = (data.u0 + pt.dot(data.spread, z[:-1])).reshape((-1, 6))
-        log_sigma = data.log_sigma + z[-1] / np.sqrt(2 * data.values.size)
+        n = data.spread.shape[1]
+        z = pm.Flat('z', shape=n + 1, initval=np.zeros(n + 1))
+        # A sum, not a dot product, which would call for a BLAS.
+        u = data.u0 + pt.sum(data.spread * z[None, :n], axis=1)
+        u = u.reshape((-1, 6))
+        log_sigma = data.log_sigma + z[n] / np.sqrt(2 * data.values.size)
         sigma = pm.Deterministic('sigma', pt.exp(log_sigma))
         fluxes = pt.exp(u[:, 0])
         total = fluxes.sum()
