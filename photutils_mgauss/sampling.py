@@ -233,11 +233,12 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
         msg = (f'n_components must be smaller, got {n_components}: in the '
                'least-squares solution a Gaussian has no flux')
         raise ValueError(msg)
+    draws = as_integer(draws, 'draws', minimum=4)
     data = _Data.prepare(image, fit, prior, unit, kwargs)
     model = _build(data)
     idata = _sample(model, sampler, progressbar=progressbar, cores=cores,
                     random_seed=random_seed,
-                    draws=as_integer(draws, 'draws', minimum=4),
+                    draws=draws,
                     tune=as_integer(tune, 'tune', minimum=0),
                     chains=as_integer(chains, 'chains', minimum=1))
     return _posterior(idata, data, fit)
@@ -431,7 +432,8 @@ def _sample(model, sampler, **options):
         del options['cores']
     with model:
         return pm.sample(nuts_sampler=sampler, target_accept=0.9,
-                         compute_convergence_checks=False, **options)
+                         compute_convergence_checks=False,
+                         quiet=not options['progressbar'], **options)
 
 
 # Labels.
