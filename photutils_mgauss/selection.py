@@ -1,149 +1,225 @@
-"""How many Gaussians an image needs (Nie et al., Appendix B)."""
-import time
+"""Which stars of an image the PSF can be measured from."""
+import warnings
 
 import numpy as np
-from astropy.table import QTable
+from astropy.stats import mad_std
+from astropy.table import QTable, Table
+from photutils.detection import DAOStarFinder
+from photutils.utils.exceptions import NoDetectionsWarning
+from scipy.spatial import KDTree
 
-from photutils_mgauss._phases import phase_error, phase_rows
-from photutils_mgauss._validation import as_integer, as_real, as_shape
-from photutils_mgauss.fitting import fit_mixture
-from photutils_mgauss.shapes import adaptive_moments
+from photutils_mgauss._star_stamps import cut_stamps
+from photutils_mgauss._tables import as_image, read_sources
+from photutils_mgauss._validation import as_integer, as_real
 
-__all__ = ['compare_n_components', 'select_n_components']
+__all__ = ['select_psf_stars']
 
-_CRITERIA = ('r2_error', 'ellipticity_error', 'rms_residual', 'max_residual',
-             'phase_error')
+# A neighbour counts if it has more than this share of the star's light.
+_NEIGHBOUR_SHARE = 0.01
+# Stars whose light is more or less concentrated than that of most, by this
+# many robust standard deviations and this share, are no single stars.
+_SHAPE_LIMIT = 5.0
+_SHAPE_SHARE = 0.15
 
 
-def compare_n_components(image, n_components=(1, 2, 3, 4, 5), **kwargs):
+def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
+                     threshold=None, radius=10, isolation=None,
+                     saturation=None, min_snr=50, max_stars=None,
+                     finder=None):
     """
-    Fit an image with several numbers of Gaussians and compare the fits.
+    Choose bright, isolated, unsaturated stars with whole stamps.
 
     Parameters
     ----------
-    image : (ny, nx) array_like
-        See `fit_mixture`.
-    n_components : sequence of int, optional
-        The numbers K to try.
-    **kwargs
-        The keywords of `fit_mixture`.
+    data : (ny, nx) array_like
+        The image, its background subtracted.
+    sources : `~astropy.table.Table`, optional
+        A catalogue with ``x``, ``y`` (or ``x_fit``, ``x_centroid``, ...) and
+        perhaps ``flux``. By default sources are detected.
+    error : (ny, nx) array_like, optional
+        The standard deviation of each pixel; by default the scatter of the
+        image.
+    mask : (ny, nx) array_like of bool, optional
+        True for pixels that cannot be used.
+    fwhm : float, optional
+        The width of stars [pix] for their detection, 3 by default.
+    threshold : float, optional
+        The height of a detection in the unit of ``data``; 5 times the
+        scatter of the image by default.
+    radius : float, optional
+        The radius of the stamps [pix]. They must be inside the image.
+    isolation : float, optional
+        The least distance of a neighbour that has more than 1 % of the
+        star's light [pix]; ``radius`` by default.
+    saturation : float, optional
+        Stars with a pixel at or above this value are saturated.
+    min_snr : float, optional
+        The least signal-to-noise ratio of the flux within 3 pixels.
+    max_stars : int, optional
+        Keep only so many, the brightest of each part of the detector.
+    finder : callable, optional
+        A photutils star finder, called as ``finder(data, mask=mask)``;
+        by default a `~photutils.detection.DAOStarFinder`.
 
     Returns
     -------
     `~astropy.table.QTable`
-        One row for each K: ``n_components``, ``time`` [s], ``chi2``,
-        ``bic``, ``r2_error`` and ``ellipticity_error`` (Eq. 8 of model
-        against image, by adaptive moments), ``rms_residual`` and
-        ``max_residual`` as fractions of the image's peak, ``phase_error``
-        [native pix], the root mean square pixel-phase error of a bright star
-        fitted in 5 x 5 pixels (NaN unless the oversampling is 2 or more), and
-        ``message``. The fits themselves are the list ``meta['fits']``.
+        All sources: ``id``, ``x``, ``y``, ``flux`` (within 3 pixels of the
+        star), ``snr``, ``peak``, ``selected`` and, for those that are not,
+        the ``reason``: 'outside', 'edge', 'masked', 'saturated', 'faint',
+        'neighbor', 'shape' or 'surplus'. `fit_mixture_field` takes it as it
+        is.
 
     Raises
     ------
     TypeError, ValueError
-        As by `fit_mixture`.
+        If an argument is not valid or no source is found.
 
     Examples
     --------
-    >>> from photutils_mgauss import GaussianMixture, compare_n_components
-    >>> truth = GaussianMixture([0.8, 0.2], [[0, 0], [0.1, 0]],
-    ...                         [[[1, 0.1], [0.1, 1]], [[4, 0], [0, 5]]])
-    >>> table = compare_n_components(truth.render(21, 10, 10), (1, 2))
-    >>> table['max_residual'].round(3)
-    array([0.022, 0.   ])
+    >>> import numpy as np
+    >>> from photutils_mgauss import GaussianMixture, select_psf_stars
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0], [0, 2]]])
+    >>> data = np.random.default_rng(1).normal(0, 1, (64, 64))
+    >>> for x, y in [(20, 30.2), (44.7, 41), (3, 50), (22, 34)]:
+    ...     data += psf.render((64, 64), x, y, flux=3000)
+    >>> stars = select_psf_stars(data)
+    >>> for star in stars:
+    ...     print(f"{star['x']:.0f} {star['y']:.0f} {star['reason'] or 'ok'}")
+    20 30 neighbor
+    22 34 neighbor
+    45 41 ok
+    3 50 edge
     """
-    numbers = [as_integer(k, 'n_components', minimum=1)
-               for k in np.atleast_1d(np.asarray(n_components, object))]
-    fit_mixture(image, 1, **kwargs)  # compiled before the clock starts
-    fits, rows = [], []
-    for k in numbers:
-        start = time.perf_counter()
-        fits.append(fit_mixture(image, k, **kwargs))
-        seconds = time.perf_counter() - start
-        rows.append((k, seconds, *_measure(image, fits[-1], kwargs),
-                     fits[-1].message))
-    return QTable(rows=rows, names=('n_components', 'time', 'chi2', 'bic',
-                                    *_CRITERIA, 'message'),
-                  meta={'fits': fits})
+    data = as_image(data, 'data')
+    error = None if error is None else as_image(error, 'error', data.shape)
+    mask = None if mask is None else as_image(mask, 'mask',
+                                              data.shape).astype(bool)
+    radius = as_real(radius, 'radius', minimum=2)
+    isolation = (radius if isolation is None
+                 else as_real(isolation, 'isolation', minimum=0))
+    min_snr = as_real(min_snr, 'min_snr', minimum=0)
+    if max_stars is not None:
+        max_stars = as_integer(max_stars, 'max_stars', minimum=1)
+    if sources is None:
+        sources = _detect(data, mask, fwhm, threshold, finder)
+    table = _measure(data, error, mask, read_sources(sources), radius)
+    _judge(table, isolation, saturation, min_snr)
+    if max_stars is not None:
+        _thin_out(table, max_stars, data.shape)
+    table['selected'] = table['reason'] == ''
+    table.remove_columns([name for name in table.colnames
+                          if name.startswith('_')])
+    return table
 
 
-def _measure(image, fit, options):
-    """Return the numbers of one row, from chi2 to phase_error."""
-    image = np.where(fit.used, np.asarray(image, float), 0.0)
-    left = fit.residual[fit.used]
-    truth, model = (adaptive_moments(picture, mask=~fit.used) for picture in
-                    (image, image - np.where(fit.used, fit.residual, 0)))
-    peak = image.max()
-    return (fit.chi2, fit.bic, truth.relative_size_error(model),
-            truth.ellipticity_error(model), left.std() / peak,
-            np.abs(left).max() / peak, _phase_error(fit, options))
-
-
-def _phase_error(fit, options):
-    oversampling = as_shape(options.get('oversampling', 1), 'oversampling')
-    if min(oversampling) < 2:
-        return np.nan
-    origin = options.get('origin')
-    if origin is None:
-        origin = (np.array(fit.used.shape[::-1]) - 1) / 2
-    rows = phase_rows(fit.mixture, fit.flux, fit.used.shape,
-                      np.array(oversampling[::-1], float),
-                      np.asarray(origin, float), fit.used, sizes=(5,))
-    return float(phase_error(rows, fit.residual)[0])
-
-
-def select_n_components(image, n_components=(1, 2, 3, 4, 5), *,
-                        r2_error=None, ellipticity_error=None,
-                        rms_residual=None, max_residual=None,
-                        phase_error=None, **kwargs):
-    """
-    Return the smallest number of Gaussians that meets thresholds.
-
-    Parameters
-    ----------
-    image : (ny, nx) array_like
-        See `fit_mixture`.
-    n_components : sequence of int, optional
-        The numbers K to try.
-    r2_error, ellipticity_error, rms_residual, max_residual, phase_error : \
-float, optional
-        Upper limits of the absolute values of these columns of
-        `compare_n_components`; at least one.
-    **kwargs
-        The keywords of `fit_mixture`.
-
-    Returns
-    -------
-    int
-        The smallest K that meets all of them.
-
-    Raises
-    ------
-    ValueError
-        If no threshold is given, or none of the numbers meets them all.
-
-    Examples
-    --------
-    >>> from photutils_mgauss import GaussianMixture, select_n_components
-    >>> truth = GaussianMixture([0.8, 0.2], [[0, 0], [0.1, 0]],
-    ...                         [[[1, 0.1], [0.1, 1]], [[4, 0], [0, 5]]])
-    >>> select_n_components(truth.render(21, 10, 10), max_residual=0.01)
-    2
-    """
-    given = (r2_error, ellipticity_error, rms_residual, max_residual,
-             phase_error)
-    limits = {name: as_real(value, name, minimum=0)
-              for name, value in zip(_CRITERIA, given, strict=True)
-              if value is not None}
-    if not limits:
-        msg = f'one of {", ".join(_CRITERIA)} must be given, got none'
+def _detect(data, mask, fwhm, threshold, finder):
+    bad = ~np.isfinite(data)
+    mask = bad if mask is None else mask | bad
+    data = np.where(bad, 0, data)
+    if finder is None:
+        fwhm = 3.0 if fwhm is None else as_real(fwhm, 'fwhm', above=0)
+        if threshold is None:
+            threshold = 5 * mad_std(data[~mask])
+        threshold = as_real(threshold, 'threshold', above=0)
+        # Sharp and flat sources are judged later, with a reason.
+        finder = DAOStarFinder(threshold, fwhm, scale_threshold=False,
+                               min_separation=0.5 * fwhm, sharpness_range=None,
+                               roundness_range=None)
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', NoDetectionsWarning)
+        found = finder(data, mask=mask)
+    if found is None or len(found) == 0:
+        msg = 'data must show at least 1 source, the finder found none'
         raise ValueError(msg)
-    for k in sorted(np.atleast_1d(n_components).tolist()):
-        row = compare_n_components(image, [k], **kwargs)[0]
-        if all(abs(row[name]) <= limit for name, limit in limits.items()):
-            return k
-    found = ', '.join(f'{name} = {abs(row[name]):.3g}' for name in limits)
-    msg = (f'n_components must reach further than {k} to meet the '
-           f'thresholds; it gave {found}')
-    raise ValueError(msg)
+    # The finder's flux is not that of the aperture used here.
+    return Table({'x': found['x_centroid'], 'y': found['y_centroid']})
+
+
+def _measure(data, error, mask, sources, radius):
+    stamps = cut_stamps(data, error, mask, sources.x, sources.y, radius)
+    if error is None:
+        stamps.base[:] = mad_std(data, ignore_nan=True) ** 2
+    inner = stamps.good & (stamps.offsets() <= 3)
+    light = np.where(inner, stamps.data, 0)
+    flux = light.sum(axis=(1, 2))
+    noise = np.sqrt(np.where(inner, stamps.base, 0).sum(axis=(1, 2)))
+    core = np.where(stamps.offsets() <= 1, light, 0).sum(axis=(1, 2))
+    n_circle = np.count_nonzero(stamps.offsets() <= radius + 0.5)
+    table = QTable()
+    table['id'] = np.arange(1, len(flux) + 1)
+    table['x'], table['y'], table['flux'] = sources.x, sources.y, flux
+    table['snr'] = flux / np.maximum(noise, 1e-300)
+    table['peak'] = light.max(axis=(1, 2))
+    table['_core'] = core / np.where(flux > 0, flux, np.inf)
+    table['_good'] = stamps.good.sum(axis=(1, 2)) / n_circle
+    half = stamps.radius
+    ny, nx = data.shape
+    with np.errstate(invalid='ignore'):
+        table['_margin'] = np.min([sources.x - half, nx - 1 - half
+                                   - sources.x, sources.y - half, ny - 1
+                                   - half - sources.y], axis=0)
+    return table
+
+
+def _judge(table, isolation, saturation, min_snr):
+    """Fill the column of reasons; the first that applies is given."""
+    margin = np.nan_to_num(table['_margin'], nan=-np.inf)
+    peak_limit = np.inf if saturation is None else as_real(saturation,
+                                                           'saturation')
+    checks = [
+        ('outside', table['_good'] == 0),
+        ('edge', margin < -0.5),
+        ('saturated', table['peak'] >= peak_limit),
+        ('masked', table['_good'] < 1),
+        ('faint', table['snr'] < min_snr),
+        ('neighbor', _has_neighbour(table, isolation))]
+    reason = np.full(len(table), '', dtype='U9')
+    for name, applies in checks:
+        reason[(reason == '') & np.asarray(applies)] = name
+    reason[(reason == '') & _odd_shape(table['_core'], reason == '')] = 'shape'
+    table['reason'] = reason
+
+
+def _has_neighbour(table, isolation):
+    found = np.zeros(len(table), bool)
+    known = np.flatnonzero(np.isfinite(table['x']) & np.isfinite(table['y']))
+    if known.size < 2 or isolation == 0:
+        return found
+    places = np.column_stack([table['x'], table['y']])[known]
+    pairs = known[KDTree(places).query_pairs(isolation, output_type='ndarray')]
+    flux = np.asarray(table['flux'])
+    for a, b in ((0, 1), (1, 0)):
+        star, other = pairs[:, a], pairs[:, b]
+        found[star[flux[other] > _NEIGHBOUR_SHARE * flux[star]]] = True
+    return found
+
+
+def _odd_shape(core, candidates):
+    """Return which stars are sharper or broader than the others."""
+    if candidates.sum() < 5:
+        return np.zeros(core.size, bool)
+    middle = np.median(core[candidates])
+    scatter = 1.4826 * np.median(np.abs(core[candidates] - middle))
+    limit = max(_SHAPE_LIMIT * scatter, _SHAPE_SHARE * middle)
+    return np.abs(core - middle) > limit
+
+
+def _thin_out(table, max_stars, shape):
+    """Keep the brightest of each cell of the detector in turn."""
+    rows = np.flatnonzero(table['reason'] == '')
+    if rows.size <= max_stars:
+        return
+    n = max(1, int(np.sqrt(max_stars / 4)))
+    ny, nx = shape
+    cell = (np.clip(table['x'][rows] / nx * n, 0, n - 1).astype(int)
+            + n * np.clip(table['y'][rows] / ny * n, 0, n - 1).astype(int))
+    order = np.argsort(-np.asarray(table['flux'][rows]))
+    rank = np.empty(rows.size, int)
+    for number in np.unique(cell):
+        inside = order[cell[order] == number]
+        rank[inside] = np.arange(inside.size)
+    keep = np.lexsort((-np.asarray(table['flux'][rows]), rank))[:max_stars]
+    surplus = np.ones(rows.size, bool)
+    surplus[keep] = False
+    table['reason'][rows[surplus]] = 'surplus'
