@@ -1759,6 +1759,9 @@ _BAD_ERROR = -1
 # its normal matrix (not of its model).
 _UNSEEN = 1e-18
 
+# How far a star may move in one step, in pixels.
+_LONGEST = 1.0
+
 # Fits stop when the next step is expected to be below this, in pixels and as
 # a fraction of the flux.
 _STEP_TOLERANCE = 1e-6
@@ -2131,16 +2134,19 @@ def _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
 
 
 @_jit
-def _factorize(matrix, frozen, damping, size, scale, factor):
+def _factorize(matrix, frozen, damping, size, steepest, scale, factor):
     """
     Put the Cholesky factor of the damped, scaled matrix into factor.
 
     scale (size,) takes the square roots of the diagonal; rows of frozen
-    parameters become those of the unit matrix. Returns whether the matrix is
-    positive definite to working precision.
+    parameters become those of the unit matrix. Damping is in units of
+    steepest, the largest diagonal so far: as a star gets faint its position
+    must not become free to run away. Returns whether the matrix is positive
+    definite to working precision.
     """
     for a in range(size):
         d = matrix[a, a]
+        steepest[a] = max(steepest[a], d)
         if frozen[a] or not d > 0:
             frozen[a] = True
             scale[a] = 1.0
@@ -2152,8 +2158,8 @@ def _factorize(matrix, frozen, damping, size, scale, factor):
                 value = 1.0 if a == b else 0.0
             else:
                 value = matrix[a, b] / (scale[a] * scale[b])
-                if a == b:
-                    value += damping
+                if a == b and damping > 0:
+                    value += damping * steepest[a] / matrix[a, a]
             for c in range(b):
                 value -= factor[a, c] * factor[b, c]
             if a == b:
@@ -2210,31 +2216,44 @@ def _step_size(step, parameters, matrix, n):
 
 
 @_jit
-def _take_step(parameters, step, lower, upper, n, size, longest, trial):
+def _take_step(parameters, step, lower, upper, n, size, trial):
     """Put the bounded end of the step into trial, the actual into step."""
     for s in range(n):
         far = max(abs(step[3 * s + 1]), abs(step[3 * s + 2]))
-        if far > longest:
-            step[3 * s + 1] *= longest / far
-            step[3 * s + 2] *= longest / far
+        if far > _LONGEST:
+            step[3 * s + 1] *= _LONGEST / far
+            step[3 * s + 2] *= _LONGEST / far
     for a in range(size):
         trial[a] = min(max(parameters[a] + step[a], lower[a]), upper[a])
         step[a] = trial[a] - parameters[a]
 
 
 @_jit
+def _expected(step, matrix, gradient, size):
+    """Return by how much the linear model says chi2 falls."""
+    total = 0.0
+    for a in range(size):
+        row = matrix[a, a] * step[a]
+        for b in range(a):
+            row += 2 * matrix[a, b] * step[b]
+        total += step[a] * (2 * gradient[a] - row)
+    return total
+
+
+@_jit
 def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
-              limits, max_iterations, longest, chi2):
+              limits, max_iterations, chi2):
     """
     Minimize chi2 of a group by Levenberg-Marquardt, from parameters.
 
     Returns the outcome and the number of evaluations; old holds the
     equations at the result, chi2[1] its sum of squares. work is (step,
-    trial, frozen, scale, factor), limits (lower, upper, fixed).
+    trial, frozen, scale, factor, steepest), limits (lower, upper, fixed).
     """
-    step, trial, frozen, scale, factor = work
+    step, trial, frozen, scale, factor, steepest = work
     lower, upper, fixed = limits
     size = 3 * n + fit_sky
+    steepest[:size] = 0.0
     _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, old,
                       chi2)
     best = chi2[1]
@@ -2243,7 +2262,8 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
     last = 1.0
     for iteration in range(max_iterations):
         _freeze(parameters, lower, upper, old[3], fixed, size, frozen)
-        if not _factorize(old[2], frozen, damping, size, scale, factor):
+        if not _factorize(old[2], frozen, damping, size, steepest, scale,
+                          factor):
             damping = max(10 * damping, 1e-6)
             if damping > 1e3:
                 return _NOT_CONVERGED, iteration + 1
@@ -2251,8 +2271,9 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
         for a in range(size):
             step[a] = 0.0 if frozen[a] else old[3][a]
         _solve(factor, scale, size, step)
-        _take_step(parameters, step, lower, upper, n, size, longest, trial)
+        _take_step(parameters, step, lower, upper, n, size, trial)
         length = _step_size(step, parameters, old[2], n)
+        expected = _expected(step, old[2], old[3], size)
         _normal_equations(trial, n, fit_sky, pixels, psf, scratch, old, new,
                           chi2)
         if not chi2[0] <= best * (1 + 1e-12) + floor:
@@ -2261,6 +2282,7 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
             damping = max(10 * damping, 1e-3)
             last = 1.0
             continue
+        poor = expected > 1e-9 * best and best - chi2[0] < 0.25 * expected
         parameters[:size] = trial[:size]
         best = chi2[1]
         for source, target in ((new[0], old[0]), (new[1], old[1])):
@@ -2272,7 +2294,10 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
         if damping == 0 and length * min(1.0, length / last) < _STEP_TOLERANCE:
             return _CONVERGED, iteration + 2
         last = length
-        damping = damping / 10 if damping > 1e-5 else 0.0
+        if poor:
+            damping = max(4 * damping, 1e-2)
+        else:
+            damping = damping / 10 if damping > 1e-4 else 0.0
     return _NOT_CONVERGED, max_iterations + 1
 
 
@@ -2284,10 +2309,10 @@ def _covariances(matrix, fixed, n, size, work, out):
     Returns the variance of the last parameter, or NaN if there is no inverse;
     then out is NaN, too.
     """
-    step, _, frozen, scale, factor = work
+    step, _, frozen, scale, factor, steepest = work
     for a in range(size):
         frozen[a] = fixed[a]
-    if not _factorize(matrix, frozen, 0.0, size, scale, factor):
+    if not _factorize(matrix, frozen, 0.0, size, steepest, scale, factor):
         out[:n] = np.nan
         return np.nan
     for a in range(size):
@@ -2393,7 +2418,7 @@ def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
               np.empty(4, np.int64), np.empty((3, 4)))
     scratch = (np.empty((most, 3, area)), np.empty(most, np.bool_), tiling)
     work = (np.empty(size), np.empty(size), np.empty(size, np.bool_),
-            np.empty(size), np.empty((size, size)))
+            np.empty(size), np.empty((size, size)), np.empty(size))
     limits = (np.empty(size), np.empty(size), np.empty(size, np.bool_))
     parameters, chi2 = np.empty(size), np.empty(2)
     for g in range(starts.size - 1):
@@ -2406,11 +2431,10 @@ def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
         if n_pixels < 0:
             outcome[stars, 0] = _BAD_ERROR
             continue
-        longest = max(1.0, 0.25 * np.max(boxes[stars, 2:]))
         pixels = (boxes[stars], data, variance, gain)
         status, evaluations = _minimize(
             parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
-            limits, max_iterations, longest, chi2)
+            limits, max_iterations, chi2)
         sky_variance = _covariances(old[2], limits[2], n, 3 * n + fit_sky,
                                     work, covariances[stars])
         _measure_fit(initial[stars, 1], initial[stars, 2], boxes[stars],
