@@ -2538,11 +2538,12 @@ def _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy, at, moves,
 
 @_jit
 def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
-                fit_sky, with_shapes, row, normal):
+                fit_sky, with_shapes, block, normal):
     """
     Sum the normal equations of a stamp into normal; return their size.
 
-    The size includes the column of the residual.
+    The size includes the column of the residual. block is scratch (4, D):
+    four pixels at a time save three of four walks through normal.
     """
     own = 3 * n_sources + fit_sky
     size = own + 1
@@ -2551,22 +2552,40 @@ def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
         size += 6 * rows.shape[0] - 3
         first = own
     normal[:size, :size] = 0.0
+    filled = 0
     for j in range(stamp.shape[0]):
         for i in range(stamp.shape[1]):
             w = weight[j, i]
             if w <= 0:
                 continue
+            row = block[filled]
             row[:size] = 0.0
             if fit_sky:
                 row[own - 1] = 1.0
             model = _design(left + i, bottom + j, rows, sources, n_sources,
                             first, row)
             row[size - 1] = stamp[j, i] - sky - model
+            root = sqrt(w)
             for m in range(size):
-                c = w * row[m]
-                for n in range(m, size):
-                    normal[m, n] += c * row[n]
+                row[m] *= root
+            filled += 1
+            if filled == 4:
+                _add_products(block, size, normal)
+                filled = 0
+    block[filled:, :size] = 0.0
+    _add_products(block, size, normal)
     return size
+
+
+@_jit
+def _add_products(block, size, normal):
+    """Add the products of the columns of block (4, D), upper triangle."""
+    r0, r1, r2, r3 = block[0], block[1], block[2], block[3]
+    for m in range(size):
+        out = normal[m]
+        c0, c1, c2, c3 = r0[m], r1[m], r2[m], r3[m]
+        for n in range(m, size):
+            out[n] += c0 * r0[n] + c1 * r1[n] + c2 * r2[n] + c3 * r3[n]
 
 
 @_jit
@@ -2606,67 +2625,83 @@ def _back_substitute(normal, n, size, step):
 
 
 @_jit
-def _settle(stamp, weight, left, bottom, rows, sources, anchors, hold,
-            n_sources, sky, fit_sky, n_steps, tolerance, row, normal, step):
-    """Fit the stamp's own numbers, its PSF given; return the sky."""
-    own = 3 * n_sources + fit_sky
-    for _ in range(n_steps):
-        size = _accumulate(stamp, weight, left, bottom, rows, sources,
-                           n_sources, sky, fit_sky, False, row, normal)
-        _hold_neighbours(sources, anchors, n_sources, hold, size, normal)
-        gain = normal[size - 1, size - 1]
-        _eliminate(normal, own, size)
-        gain -= normal[size - 1, size - 1]
-        _back_substitute(normal, own, size, step)
-        for j in range(n_sources):
-            for i in range(2):
-                # A longer step would leave the core, where linear is wrong.
-                sources[j, i] += min(max(step[3 * j + i], -0.5), 0.5)
-            sources[j, 2] += step[3 * j + 2]
-        if fit_sky:
-            sky += step[own - 1]
-        if not gain > tolerance:
-            break
+def solve(augmented, step):
+    """
+    Solve a symmetric positive definite system for step (n,).
+
+    augmented (n, n + 1) holds the matrix and the right side; only the upper
+    triangle is read, and destroyed.
+    """
+    n = step.size
+    for k in range(n):
+        pivot = augmented[k, k]
+        if not pivot > 0:
+            continue
+        upper = augmented[k]
+        for i in range(k + 1, n):
+            factor = upper[i] / pivot
+            row = augmented[i]
+            for j in range(i, n + 1):
+                row[j] -= factor * upper[j]
+    _back_substitute(augmented, n, n + 1, step)
+
+
+@_jit
+def _move(sources, n_sources, sky, fit_sky, step):
+    """Add the step to a stamp's own numbers; return the sky."""
+    for j in range(n_sources):
+        for i in range(2):
+            # A longer step would leave the core, where linear is wrong.
+            sources[j, i] += min(max(step[3 * j + i], -0.5), 0.5)
+        sources[j, 2] += step[3 * j + 2]
+    if fit_sky:
+        return sky + step[3 * n_sources]
     return sky
 
 
 @_jit
 def field_normal(stamps, weights, corners, basis, coefficients, sources,
                  anchors, hold, n_sources, sky, fit_sky, used, n_steps,
-                 tolerance, normal, total, gradient, chi2):
+                 normal, total, gradient, chi2):
     """
     Settle n stars and add the equations of the used ones to total, gradient.
+
+    Each star's own numbers take n_steps Gauss-Newton steps, the PSF given;
+    the last one is taken together with the equations of the shapes, so that
+    chi2 (n,) and gradient are those after it.
 
     stamps, weights (n, s, s); corners (n, 2), the pixel (x, y) of each
     stamp's first; basis (n, T); coefficients (T, K, 6); sources, anchors,
     hold (n, M, 3); n_sources (n,); sky (n,) with fit_sky; used (n,). normal
     is scratch (D, D) with D = 3 M + 6 K - 1. total (P T, P T), upper
     triangle, and gradient (P T,) order unknowns by shape, then term, with
-    P = 6 K - 3. chi2 (n,).
+    P = 6 K - 3.
     """
     k = coefficients.shape[1]
     shapes = np.empty((k, 6))
     rows = np.empty((k, 6))
-    row = np.empty(normal.shape[0])
+    block = np.empty((4, normal.shape[0]))
     step = np.empty(normal.shape[0])
     spread = np.empty(gradient.size)
     for star in range(stamps.shape[0]):
         _shapes_at(basis[star], coefficients, shapes)
         shape_rows(shapes, rows)
         left, bottom = corners[star]
-        sky[star] = _settle(
-            stamps[star], weights[star], left, bottom, rows, sources[star],
-            anchors[star], hold[star], n_sources[star], sky[star], fit_sky,
-            n_steps, tolerance, row, normal, step)
-        size = _accumulate(
-            stamps[star], weights[star], left, bottom, rows, sources[star],
-            n_sources[star], sky[star], fit_sky, used[star], row, normal)
-        _hold_neighbours(sources[star], anchors[star], n_sources[star],
-                         hold[star], size, normal)
+        own = 3 * n_sources[star] + fit_sky
+        for i in range(n_steps):
+            last = used[star] and i == n_steps - 1
+            size = _accumulate(
+                stamps[star], weights[star], left, bottom, rows,
+                sources[star], n_sources[star], sky[star], fit_sky, last,
+                block, normal)
+            _hold_neighbours(sources[star], anchors[star], n_sources[star],
+                             hold[star], size, normal)
+            _eliminate(normal, own, size)
+            _back_substitute(normal, own, size, step)
+            sky[star] = _move(sources[star], n_sources[star], sky[star],
+                              fit_sky, step)
         chi2[star] = normal[size - 1, size - 1]
         if used[star]:
-            own = 3 * n_sources[star] + fit_sky
-            _eliminate(normal, own, size)
             _spread(normal, own, size, basis[star], spread, total, gradient)
 
 
