@@ -297,6 +297,31 @@ def jets(x, y, rows, integrated, out):
             out[k, 5, i] = a * gyy
 
 
+# The shape parameters of an astropy model, (6 K - 1,): K - 1 stick-breaking
+# fractions, then x, y, stddev_x, stddev_y, rho of each Gaussian.
+
+@_jit
+def model_rows(values, min_stddev, max_rho, rows):
+    """Put the mixture of any parameters, valid or not, into rows (K, 6)."""
+    n = rows.shape[0]
+    rest = 1.0
+    for k in range(n):
+        fraction = values[k] if k < n - 1 else 1.0
+        first = n - 1 + 5 * k
+        sx = max(abs(values[first + 2]), min_stddev)
+        sy = max(abs(values[first + 3]), min_stddev)
+        rho = min(max(values[first + 4], -max_rho), max_rho)
+        p = 1 / (sx * sx * (1 - rho) * (1 + rho))
+        q = 1 / (sy * sy)
+        rows[k, 0] = rest * fraction * sqrt(p * q) / (2 * np.pi)
+        rows[k, 1] = values[first]
+        rows[k, 2] = values[first + 1]
+        rows[k, 3] = p
+        rows[k, 4] = rho * sx / sy
+        rows[k, 5] = q
+        rest *= 1 - fraction
+
+
 # Mixtures on a pixel lattice.
 
 @_jit
