@@ -297,6 +297,31 @@ def jets(x, y, rows, integrated, out):
             out[k, 5, i] = a * gyy
 
 
+# The shape parameters of an astropy model, (6 K - 1,): K - 1 stick-breaking
+# fractions, then x, y, stddev_x, stddev_y, rho of each Gaussian.
+
+@_jit
+def model_rows(values, min_stddev, max_rho, rows):
+    """Put the mixture of any parameters, valid or not, into rows (K, 6)."""
+    n = rows.shape[0]
+    rest = 1.0
+    for k in range(n):
+        fraction = values[k] if k < n - 1 else 1.0
+        first = n - 1 + 5 * k
+        sx = max(abs(values[first + 2]), min_stddev)
+        sy = max(abs(values[first + 3]), min_stddev)
+        rho = min(max(values[first + 4], -max_rho), max_rho)
+        p = 1 / (sx * sx * (1 - rho) * (1 + rho))
+        q = 1 / (sy * sy)
+        rows[k, 0] = rest * fraction * sqrt(p * q) / (2 * np.pi)
+        rows[k, 1] = values[first]
+        rows[k, 2] = values[first + 1]
+        rows[k, 3] = p
+        rows[k, 4] = rho * sx / sy
+        rows[k, 5] = q
+        rest *= 1 - fraction
+
+
 # Mixtures on a pixel lattice.
 
 @_jit
@@ -830,6 +855,662 @@ def render_matched_image(x, y, flux, sums, x_grid, y_grid, integrated,
 
 
 @_jit
+def draw_unit(shapes, cx, cy, images):
+    """Put Gaussians of unit flux into images (K, ny, nx)."""
+    for k in range(shapes.shape[0]):
+        mx, my, log_l, t, log_m = shapes[k]
+        length, m = exp(log_l), exp(log_m)
+        peak = exp(log_l + log_m - _LOG_2PI)
+        for j in range(images.shape[1]):
+            row = images[k, j]
+            row[:] = 0.0
+            v = j - cy - my
+            q = m * m * v * v
+            if q < _LOG_NOTHING:
+                _add_row(peak * exp(-0.5 * q), -cx - mx + t / length * v,
+                         length * length, row)
+
+
+@_jit
+def _columns_of_product(a, b, weight, cy, columns):
+    """
+    Put sum_y w a b y^m into columns[m, x], m <= 4.
+
+    Four columns at a time with sums of their own: the compiler packs them
+    into vectors, which it must not do to a single sum.
+    """
+    ny, nx = a.shape
+    blocks = nx - nx % 4
+    for i in range(0, blocks, 4):
+        p0, p1, p2, p3 = 0.0, 0.0, 0.0, 0.0
+        q0, q1, q2, q3 = 0.0, 0.0, 0.0, 0.0
+        r0, r1, r2, r3 = 0.0, 0.0, 0.0, 0.0
+        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+        t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
+        for j in range(ny):
+            v = j - cy
+            h0 = weight[j, i] * a[j, i] * b[j, i]
+            h1 = weight[j, i + 1] * a[j, i + 1] * b[j, i + 1]
+            h2 = weight[j, i + 2] * a[j, i + 2] * b[j, i + 2]
+            h3 = weight[j, i + 3] * a[j, i + 3] * b[j, i + 3]
+            p0, p1, p2, p3 = p0 + h0, p1 + h1, p2 + h2, p3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            q0, q1, q2, q3 = q0 + h0, q1 + h1, q2 + h2, q3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            r0, r1, r2, r3 = r0 + h0, r1 + h1, r2 + h2, r3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            s0, s1, s2, s3 = s0 + h0, s1 + h1, s2 + h2, s3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            t0, t1, t2, t3 = t0 + h0, t1 + h1, t2 + h2, t3 + h3
+        _put(columns[0], i, p0, p1, p2, p3)
+        _put(columns[1], i, q0, q1, q2, q3)
+        _put(columns[2], i, r0, r1, r2, r3)
+        _put(columns[3], i, s0, s1, s2, s3)
+        _put(columns[4], i, t0, t1, t2, t3)
+    for i in range(blocks, nx):
+        p, q, r, s, t = 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(ny):
+            v = j - cy
+            h = weight[j, i] * a[j, i] * b[j, i]
+            p += h
+            q += h * v
+            r += h * v * v
+            s += h * v * v * v
+            t += h * v * v * v * v
+        columns[0, i], columns[1, i], columns[2, i] = p, q, r
+        columns[3, i], columns[4, i] = s, t
+
+
+@_jit
+def _put(row, i, a, b, c, d):
+    row[i], row[i + 1], row[i + 2], row[i + 3] = a, b, c, d
+
+
+@_jit
+def _moments_of_product(a, b, weight, cx, cy, columns, out):
+    """
+    Put sum_pixels w a b x^n y^m into out[n, m], n + m <= 4.
+
+    columns (5, nx) is scratch.
+    """
+    _columns_of_product(a, b, weight, cy, columns)
+    a0, a1, a2, a3, a4 = 0.0, 0.0, 0.0, 0.0, 0.0
+    b0, b1, b2, b3 = 0.0, 0.0, 0.0, 0.0
+    c0, c1, c2 = 0.0, 0.0, 0.0
+    d0, d1, e0 = 0.0, 0.0, 0.0
+    for i in range(columns.shape[1]):
+        x = i - cx
+        xx = x * x
+        s0, s1, s2 = columns[0, i], columns[1, i], columns[2, i]
+        a0, a1, a2 = a0 + s0, a1 + s1, a2 + s2
+        a3, a4 = a3 + columns[3, i], a4 + columns[4, i]
+        b0, b1 = b0 + x * s0, b1 + x * s1
+        b2, b3 = b2 + x * s2, b3 + x * columns[3, i]
+        c0, c1, c2 = c0 + xx * s0, c1 + xx * s1, c2 + xx * s2
+        d0, d1 = d0 + xx * x * s0, d1 + xx * x * s1
+        e0 += xx * xx * s0
+    out[0, 0], out[0, 1], out[0, 2], out[0, 3], out[0, 4] = a0, a1, a2, a3, a4
+    out[1, 0], out[1, 1], out[1, 2], out[1, 3] = b0, b1, b2, b3
+    out[2, 0], out[2, 1], out[2, 2] = c0, c1, c2
+    out[3, 0], out[3, 1], out[4, 0] = d0, d1, e0
+
+
+@_jit
+def _polynomials(shape, out):
+    """
+    Put g and its derivatives by the five shape numbers into out (6, 6).
+
+    As multiples of g: the coefficients of 1, x, y, xx, xy, yy.
+    """
+    mx, my, log_l, t, log_m = shape
+    length, m = exp(log_l), exp(log_m)
+    # a = length x + t y + a0, b = m y + b0.
+    a0 = -length * mx - t * my
+    b0 = -m * my
+    out[:] = 0.0
+    out[0, 0] = 1.0
+    out[1, 0], out[1, 1], out[1, 2] = length * a0, length * length, length * t
+    out[2, 0] = t * a0 + m * b0
+    out[2, 1] = t * length
+    out[2, 2] = t * t + m * m
+    # 1 - length u a
+    out[3, 0] = 1.0 + length * mx * a0
+    out[3, 1] = -length * a0 + length * mx * length
+    out[3, 2] = length * mx * t
+    out[3, 3] = -length * length
+    out[3, 4] = -length * t
+    # -v a
+    out[4, 0] = my * a0
+    out[4, 1] = my * length
+    out[4, 2] = my * t - a0
+    out[4, 4] = -length
+    out[4, 5] = -t
+    # 1 - b^2
+    out[5, 0] = 1.0 - b0 * b0
+    out[5, 2] = -2 * m * b0
+    out[5, 5] = -m * m
+
+
+# The powers of x and y in the monomials 1, x, y, xx, xy, yy.
+_POWER_X = np.array([0, 1, 0, 2, 1, 0])
+_POWER_Y = np.array([0, 0, 1, 0, 1, 2])
+
+
+@_jit
+def _contract(left, moments, right, half, out):
+    """
+    Put the moments of a product, seen by its parameters, into out (6, 6).
+
+    left and right (6, 6) are the polynomials of the two Gaussians; half
+    (6, 6) is scratch.
+    """
+    half[:] = 0.0
+    for a in range(6):
+        for c in range(6):
+            moment = moments[_POWER_X[a] + _POWER_X[c],
+                             _POWER_Y[a] + _POWER_Y[c]]
+            for j in range(6):
+                half[a, j] += moment * right[j, c]
+    out[:] = 0.0
+    for i in range(6):
+        for a in range(6):
+            for j in range(6):
+                out[i, j] += left[i, a] * half[a, j]
+
+
+@_jit
+def _factor(matrix, n):
+    """
+    Overwrite the lower triangle of matrix (n, n) by its Cholesky factor.
+
+    A pivot lost to rounding is replaced by a huge one, which sets the unknown
+    to zero instead of ending the fit.
+    """
+    for j in range(n):
+        diagonal = matrix[j, j]
+        pivot = diagonal
+        for k in range(j):
+            pivot -= matrix[j, k] * matrix[j, k]
+        if not pivot > 1e-14 * diagonal:
+            pivot = 1e30 * max(diagonal, 1e-30)
+        root = sqrt(pivot)
+        matrix[j, j] = root
+        for i in range(j + 1, n):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = total / root
+
+
+@_jit
+def _solve_factored(factor, n, x):
+    """Overwrite x (n,) by the solution of factor factor^T y = x."""
+    for i in range(n):
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= factor[k, i] * x[k]
+        x[i] /= factor[i, i]
+
+
+@_jit
+def _solve_subset(gram, rhs, active, x, work):
+    """Solve gram x = rhs over the active unknowns; the others are zero."""
+    n = rhs.size
+    count = 0
+    for i in range(n):
+        if not active[i]:
+            continue
+        column = 0
+        for j in range(i + 1):
+            if active[j]:
+                work[count, column] = gram[i, j]
+                column += 1
+        work[count, n] = rhs[i]
+        count += 1
+    _factor(work, count)
+    solution = work[:count, n].copy()
+    _solve_factored(work, count, solution)
+    count = 0
+    for i in range(n):
+        x[i] = 0.0
+        if active[i]:
+            x[i] = solution[count]
+            count += 1
+
+
+@_jit
+def _steepest(gram, rhs, active, x):
+    """Return the inactive unknown that would lower the cost most, or -1."""
+    best, gain = -1, 0.0
+    for i in range(rhs.size):
+        if active[i]:
+            continue
+        slope = rhs[i]
+        for j in range(rhs.size):
+            slope -= gram[i, j] * x[j]
+        if slope > 1e-12 * abs(rhs[i]) + gain:
+            best, gain = i, slope
+    return best
+
+
+@_jit
+def _solve_fluxes(gram, rhs, signed, x, active, work):
+    """
+    Solve min |G x - z| given gram = G^T G and rhs = G^T z.
+
+    Unless signed, x >= 0: Lawson and Hanson's active set, started from all
+    unknowns free. work is (n, n + 1).
+    Solve min |G x - z| with x >= 0, unless signed.
+
+    gram is G^T G, rhs G^T z. Lawson and Hanson's active set, started from
+    all unknowns free. work is (n, n + 1).
+    """
+    n = rhs.size
+    active[:] = True
+    _solve_subset(gram, rhs, active, x, work)
+    if signed:
+        return
+    for _ in range(3 * n):
+        worst = np.argmin(x)
+        if x[worst] < 0:
+            active[worst] = False
+            _solve_subset(gram, rhs, active, x, work)
+            continue
+        best = _steepest(gram, rhs, active, x)
+        if best < 0:
+            return
+        active[best] = True
+        _solve_subset(gram, rhs, active, x, work)
+        if x[best] <= 0:
+            active[best] = False
+            _solve_subset(gram, rhs, active, x, work)
+            return
+    for i in range(n):
+        x[i] = max(x[i], 0.0)
+
+
+@_jit
+def _hinge(excess, slopes, stiffness, matrix, gradient):
+    """Add the square of an excess > 0 to the normal equations of one shape."""
+    if excess <= 0:
+        return 0.0
+    for i in range(5):
+        gradient[i] -= stiffness * excess * slopes[i]
+        for j in range(5):
+            matrix[i, j] += stiffness * slopes[i] * slopes[j]
+    return stiffness * excess * excess
+
+
+@_jit
+def penalty(shape, limits, matrix, gradient):
+    """
+    Return the price of a Gaussian outside its limits.
+
+    The limits hold for the widths of its cuts along x and y (not narrower
+    than the pixels can show) and of its projections (not wider than the
+    stamp), and for its mean (on the stamp). Inside them the price is zero; it
+    grows with the square of the excess. matrix (5, 5) and gradient (5,)
+    receive its share of the normal equations.
+    """
+    x, y, log_l, t, log_m = shape
+    m = exp(log_m)
+    stiffness = limits[_STIFFNESS]
+    slopes = np.zeros(5)
+    slopes[2] = 1.0
+    price = _hinge(log_l + limits[_NARROW], slopes, stiffness, matrix,
+                   gradient)
+    norm = t * t + m * m
+    slopes[2], slopes[3], slopes[4] = 0.0, t / norm, m * m / norm
+    price += _hinge(0.5 * np.log(norm) + limits[_NARROW], slopes, stiffness,
+                    matrix, gradient)
+    slopes[2], slopes[4] = -1.0, m * m / norm - 1
+    price += _hinge(0.5 * np.log(norm) - log_l - log_m - limits[_WIDE],
+                    slopes, stiffness, matrix, gradient)
+    slopes[2], slopes[3], slopes[4] = 0.0, 0.0, -1.0
+    price += _hinge(-log_m - limits[_WIDE], slopes, stiffness, matrix,
+                    gradient)
+    slopes[4] = 0.0
+    slopes[0] = 1 / limits[_REACH_X] if x > 0 else -1 / limits[_REACH_X]
+    price += _hinge(abs(x) / limits[_REACH_X] - 1, slopes, stiffness, matrix,
+                    gradient)
+    slopes[0] = 0.0
+    slopes[1] = 1 / limits[_REACH_Y] if y > 0 else -1 / limits[_REACH_Y]
+    price += _hinge(abs(y) / limits[_REACH_Y] - 1, slopes, stiffness, matrix,
+                    gradient)
+    return price
+
+
+@_jit
+def _residual(stamp, images, fluxes, out):
+    """Put stamp minus model into out (ny, nx)."""
+    for j in range(stamp.shape[0]):
+        for i in range(stamp.shape[1]):
+            out[j, i] = stamp[j, i]
+    for k in range(fluxes.size):
+        for j in range(stamp.shape[0]):
+            for i in range(stamp.shape[1]):
+                out[j, i] -= fluxes[k] * images[k, j, i]
+
+
+@_jit
+def project(stamp, weight, centre, shapes, tie, signed, rows, fluxes,
+            scratch):
+    """
+    Put the best fluxes for the shapes into fluxes; return the chi square.
+
+    tie is the total flux and the weight of that condition (0: free). rows
+    (m, ny, nx) are sums over the residual whose squares count too; m may be
+    0. The images and the residual are left in scratch.
+    """
+    images, residual, gram, rhs, work, active = scratch[:6]
+    total, tie_weight = tie
+    draw_unit(shapes, centre[0], centre[1], images)
+    n = fluxes.size
+    for k in range(n):
+        rhs[k] = _weighted_dot(images[k], stamp, weight) + tie_weight * total
+        for other in range(k + 1):
+            dot = _weighted_dot(images[k], images[other], weight) + tie_weight
+            gram[k, other] = gram[other, k] = dot
+    if rows.shape[0] > 0:
+        _add_rows_to_fluxes(rows, stamp, images, gram, rhs)
+    _solve_fluxes(gram, rhs, signed, fluxes, active, work)
+    _residual(stamp, images, fluxes, residual)
+    chi2 = _weighted_dot(residual, residual, weight)
+    for row in rows:
+        chi2 += _dot(row, residual) ** 2
+    lack = fluxes.sum() - total
+    return chi2 + tie_weight * lack * lack
+
+
+@_jit
+def _dot(a, b):
+    """Return sum_pixels a b."""
+    total = 0.0
+    for j in range(a.shape[0]):
+        for i in range(a.shape[1]):
+            total += a[j, i] * b[j, i]
+    return total
+
+
+@_jit
+def _add_rows_to_fluxes(rows, stamp, images, gram, rhs):
+    """Add rows (m, ny, nx) over the residual to the equations of fluxes."""
+    seen = np.empty(images.shape[0])
+    for row in rows:
+        want = _dot(row, stamp)
+        for k in range(seen.size):
+            seen[k] = _dot(row, images[k])
+        for k in range(seen.size):
+            rhs[k] += seen[k] * want
+            for other in range(seen.size):
+                gram[k, other] += seen[k] * seen[other]
+
+
+@_jit
+def _add_rows(rows, centre, residual, images, fluxes, polynomials, matrix,
+              gradient):
+    """Add rows (m, ny, nx) over the residual to the normal equations."""
+    n = fluxes.size
+    sums, slopes = np.empty(6), np.empty(6 * n)
+    for row in rows:
+        left = _dot(row, residual)
+        for k in range(n):
+            _row_moments(row, images[k], centre, sums)
+            for i in range(6):
+                slope = 0.0
+                for a in range(6):
+                    slope += polynomials[k, i, a] * sums[a]
+                slopes[_unknown(n, k, i)] = slope * (fluxes[k] if i else 1.0)
+        for i in range(6 * n):
+            gradient[i] += slopes[i] * left
+            for j in range(6 * n):
+                matrix[i, j] += slopes[i] * slopes[j]
+
+
+@_jit
+def _row_moments(row, image, centre, sums):
+    """Put sum_pixels row image (1, x, y, xx, xy, yy) into sums (6,)."""
+    sums[:] = 0.0
+    for j in range(image.shape[0]):
+        s0, s1, s2 = 0.0, 0.0, 0.0
+        for i in range(image.shape[1]):
+            h = row[j, i] * image[j, i]
+            x = i - centre[0]
+            s0 += h
+            s1 += h * x
+            s2 += h * x * x
+        y = j - centre[1]
+        sums[0] += s0
+        sums[1] += s1
+        sums[2] += y * s0
+        sums[3] += s2
+        sums[4] += y * s1
+        sums[5] += y * y * s0
+
+
+@_jit
+def _weighted_dot(a, b, weight):
+    """Return sum_pixels w a b, in four sums that make a vector."""
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    blocks = a.shape[1] - a.shape[1] % 4
+    for j in range(a.shape[0]):
+        for i in range(0, blocks, 4):
+            s0 += weight[j, i] * a[j, i] * b[j, i]
+            s1 += weight[j, i + 1] * a[j, i + 1] * b[j, i + 1]
+            s2 += weight[j, i + 2] * a[j, i + 2] * b[j, i + 2]
+            s3 += weight[j, i + 3] * a[j, i + 3] * b[j, i + 3]
+        for i in range(blocks, a.shape[1]):
+            s0 += weight[j, i] * a[j, i] * b[j, i]
+    return s0 + s1 + s2 + s3
+
+
+@_jit
+def normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
+                     matrix, gradient):
+    """
+    Put the normal equations into matrix (6K, 6K) and gradient (6K,).
+
+    The unknowns are the K fluxes and five shape numbers for each Gaussian.
+    The images and the residual come from `project`.
+    """
+    images, residual = scratch[:2]
+    polynomials, columns, moments, half, block = scratch[6:]
+    n = fluxes.size
+    for k in range(n):
+        _polynomials(shapes[k], polynomials[k])
+        _moments_of_product(images[k], residual, weight, centre[0], centre[1],
+                            columns, moments)
+        for i in range(6):
+            slope = 0.0
+            for a in range(6):
+                slope += (polynomials[k, i, a]
+                          * moments[_POWER_X[a], _POWER_Y[a]])
+            gradient[_unknown(n, k, i)] = slope * (fluxes[k] if i else 1.0)
+    for k in range(n):
+        for other in range(k + 1):
+            _moments_of_product(images[k], images[other], weight, centre[0],
+                                centre[1], columns, moments)
+            _contract(polynomials[k], moments, polynomials[other], half,
+                      block)
+            _place(block, k, other, fluxes, matrix)
+            matrix[k, other] += tie[1]
+            matrix[other, k] = matrix[k, other]
+    if rows.shape[0] > 0:
+        _add_rows(rows, centre, residual, images, fluxes, polynomials, matrix,
+                  gradient)
+
+
+@_jit
+def _unknown(n, k, i):
+    """Return where number i (0: flux) of Gaussian k of n is stored."""
+    return k if i == 0 else n + 5 * k + i - 1
+
+
+@_jit
+def _place(block, k, other, fluxes, matrix):
+    """Write the 6x6 block of two Gaussians into the normal matrix."""
+    n = fluxes.size
+    for i in range(6):
+        row = _unknown(n, k, i)
+        scale = fluxes[k] if i else 1.0
+        for j in range(6):
+            column = _unknown(n, other, j)
+            value = scale * block[i, j] * (fluxes[other] if j else 1.0)
+            matrix[row, column] = value
+            matrix[column, row] = value
+
+
+@_jit
+def add_penalties(shapes, limits, matrix, gradient):
+    """Add the limits to the normal equations; return their price."""
+    n = shapes.shape[0]
+    price = 0.0
+    for k in range(n):
+        first = n + 5 * k
+        price += penalty(shapes[k], limits,
+                          matrix[first:first + 5, first:first + 5],
+                          gradient[first:first + 5])
+    return price
+
+
+@_jit
+def _step(matrix, gradient, fluxes, damping, fixed_means, factor, step):
+    """
+    Put the damped step of all unknowns into step (6K,).
+
+    The fluxes are not damped. A Gaussian without flux stands still. Returns
+    the predicted decrease of the cost.
+    """
+    n = fluxes.size
+    size = gradient.size
+    floor = 0.0
+    for i in range(n, size):
+        floor = max(floor, matrix[i, i])
+    for i in range(size):
+        k = i if i < n else (i - n) // 5
+        still = fluxes[k] == 0 or (fixed_means and i >= n
+                                   and (i - n) % 5 < 2)
+        step[i] = 0.0 if still else gradient[i]
+        for j in range(i):
+            other = j if j < n else (j - n) // 5
+            factor[i, j] = (0.0 if still or fluxes[other] == 0
+                            else matrix[i, j])
+        factor[i, i] = matrix[i, i]
+        if i >= n:
+            factor[i, i] += damping * (matrix[i, i] + 1e-9 * floor)
+        if still:
+            factor[i, i] = 1.0
+    if fixed_means:
+        _uncouple_means(n, factor)
+    _factor(factor, size)
+    _solve_factored(factor, size, step)
+    gain = 0.0
+    for i in range(n, size):
+        gain += step[i] * (gradient[i] + damping * step[i]
+                           * (matrix[i, i] + 1e-9 * floor))
+    return gain
+
+
+@_jit
+def _uncouple_means(n, factor):
+    for k in range(n):
+        for c in range(2):
+            i = n + 5 * k + c
+            for j in range(i + 1, factor.shape[0]):
+                factor[j, i] = 0.0
+
+
+@_jit
+def _move(shapes, step, out):
+    """Put shapes moved by the step into out, no width by more than e-fold."""
+    n = shapes.shape[0]
+    for k in range(n):
+        for i in range(5):
+            change = step[n + 5 * k + i]
+            if i == 2 or i == 4:
+                change = min(max(change, -1.0), 1.0)
+            out[k, i] = shapes[k, i] + change
+
+
+@_jit
+def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed, rows,
+               fixed_means, limits, tolerance, max_steps, scratch, matrices,
+               vectors):
+    """
+    Fit K Gaussians to a stamp by Levenberg-Marquardt, in place.
+
+    Parameters
+    ----------
+    stamp, weight : (ny, nx)
+        Pixels and their weights; a weight of 0 leaves a pixel out, whatever
+        finite number is in it.
+    centre : (2,)
+        The pixel x, y to which the means are relative.
+    shapes, fluxes : (K, 5), (K,)
+        Where to start (the fluxes are only written), and the result.
+    tie : (2,)
+        The total flux and the weight of that condition (0: free).
+    signed : bool
+        Whether fluxes may be negative.
+    rows : (m, ny, nx)
+        Sums over the residual whose squares are part of the cost.
+    fixed_means : bool
+        Whether means stay as they are.
+    limits : (5,)
+        See `penalty`.
+    tolerance, max_steps
+        Stop when two steps running lower the cost by less than this fraction,
+        or after so many steps.
+    scratch, matrices, vectors
+        From `fitting.Workspace`.
+
+    Returns
+    -------
+    cost, status, steps
+    """
+    matrix, factor = matrices
+    gradient, step, trial, trial_fluxes = vectors
+    idle_matrix, idle_gradient = factor, step
+    cost = project(stamp, weight, centre, shapes, tie, signed, rows, fluxes,
+                   scratch)
+    normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
+                     matrix, gradient)
+    cost += add_penalties(shapes, limits, matrix, gradient)
+    damping, growth, small = 1e-2, 2.0, 0
+    for n_steps in range(1, max_steps + 1):
+        gain = _step(matrix, gradient, fluxes, damping, fixed_means, factor,
+                     step)
+        _move(shapes, step, trial)
+        trial_cost = project(stamp, weight, centre, trial, tie, signed, rows,
+                             trial_fluxes, scratch)
+        trial_cost += add_penalties(trial, limits, idle_matrix,
+                                     idle_gradient)
+        if not trial_cost < cost:
+            damping *= growth
+            growth *= 2
+            if damping > 1e12 or not gain > 1e-14 * cost:
+                return cost, FIT_CONVERGED, n_steps
+            continue
+        drop = cost - trial_cost
+        shapes[:] = trial
+        fluxes[:] = trial_fluxes
+        normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
+                         matrix, gradient)
+        add_penalties(shapes, limits, matrix, gradient)
+        small = small + 1 if drop <= tolerance * cost else 0
+        cost = trial_cost
+        if small >= 2:
+            return cost, FIT_CONVERGED, n_steps
+        quality = 2 * drop / max(gain, 1e-300) - 1
+        damping = max(damping * max(0.2, 1 - quality ** 3), 1e-15)
+        growth = 2.0
+    return cost, FIT_STOPPED, max_steps
+
+
+@_jit
 def bleed(columns, full_well):
     """
     Spread the charge above the full well along each column (n, ny), in place.
@@ -1102,6 +1783,9 @@ _BAD_ERROR = -1
 # Stars whose unit-flux image is nowhere above this in a box are left out of
 # its normal matrix (not of its model).
 _UNSEEN = 1e-18
+
+# How far a star may move in one step, in pixels.
+_LONGEST = 1.0
 
 # Fits stop when the next step is expected to be below this, in pixels and as
 # a fraction of the flux.
@@ -1475,16 +2159,19 @@ def _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
 
 
 @_jit
-def _factorize(matrix, frozen, damping, size, scale, factor):
+def _factorize(matrix, frozen, damping, size, steepest, scale, factor):
     """
     Put the Cholesky factor of the damped, scaled matrix into factor.
 
     scale (size,) takes the square roots of the diagonal; rows of frozen
-    parameters become those of the unit matrix. Returns whether the matrix is
-    positive definite to working precision.
+    parameters become those of the unit matrix. Damping is in units of
+    steepest, the largest diagonal so far: as a star gets faint its position
+    must not become free to run away. Returns whether the matrix is positive
+    definite to working precision.
     """
     for a in range(size):
         d = matrix[a, a]
+        steepest[a] = max(steepest[a], d)
         if frozen[a] or not d > 0:
             frozen[a] = True
             scale[a] = 1.0
@@ -1496,8 +2183,8 @@ def _factorize(matrix, frozen, damping, size, scale, factor):
                 value = 1.0 if a == b else 0.0
             else:
                 value = matrix[a, b] / (scale[a] * scale[b])
-                if a == b:
-                    value += damping
+                if a == b and damping > 0:
+                    value += damping * steepest[a] / matrix[a, a]
             for c in range(b):
                 value -= factor[a, c] * factor[b, c]
             if a == b:
@@ -1554,31 +2241,44 @@ def _step_size(step, parameters, matrix, n):
 
 
 @_jit
-def _take_step(parameters, step, lower, upper, n, size, longest, trial):
+def _take_step(parameters, step, lower, upper, n, size, trial):
     """Put the bounded end of the step into trial, the actual into step."""
     for s in range(n):
         far = max(abs(step[3 * s + 1]), abs(step[3 * s + 2]))
-        if far > longest:
-            step[3 * s + 1] *= longest / far
-            step[3 * s + 2] *= longest / far
+        if far > _LONGEST:
+            step[3 * s + 1] *= _LONGEST / far
+            step[3 * s + 2] *= _LONGEST / far
     for a in range(size):
         trial[a] = min(max(parameters[a] + step[a], lower[a]), upper[a])
         step[a] = trial[a] - parameters[a]
 
 
 @_jit
+def _expected(step, matrix, gradient, size):
+    """Return by how much the linear model says chi2 falls."""
+    total = 0.0
+    for a in range(size):
+        row = matrix[a, a] * step[a]
+        for b in range(a):
+            row += 2 * matrix[a, b] * step[b]
+        total += step[a] * (2 * gradient[a] - row)
+    return total
+
+
+@_jit
 def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
-              limits, max_iterations, longest, chi2):
+              limits, max_iterations, chi2):
     """
     Minimize chi2 of a group by Levenberg-Marquardt, from parameters.
 
     Returns the outcome and the number of evaluations; old holds the
     equations at the result, chi2[1] its sum of squares. work is (step,
-    trial, frozen, scale, factor), limits (lower, upper, fixed).
+    trial, frozen, scale, factor, steepest), limits (lower, upper, fixed).
     """
-    step, trial, frozen, scale, factor = work
+    step, trial, frozen, scale, factor, steepest = work
     lower, upper, fixed = limits
     size = 3 * n + fit_sky
+    steepest[:size] = 0.0
     _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, old,
                       chi2)
     best = chi2[1]
@@ -1587,7 +2287,8 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
     last = 1.0
     for iteration in range(max_iterations):
         _freeze(parameters, lower, upper, old[3], fixed, size, frozen)
-        if not _factorize(old[2], frozen, damping, size, scale, factor):
+        if not _factorize(old[2], frozen, damping, size, steepest, scale,
+                          factor):
             damping = max(10 * damping, 1e-6)
             if damping > 1e3:
                 return _NOT_CONVERGED, iteration + 1
@@ -1595,8 +2296,9 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
         for a in range(size):
             step[a] = 0.0 if frozen[a] else old[3][a]
         _solve(factor, scale, size, step)
-        _take_step(parameters, step, lower, upper, n, size, longest, trial)
+        _take_step(parameters, step, lower, upper, n, size, trial)
         length = _step_size(step, parameters, old[2], n)
+        expected = _expected(step, old[2], old[3], size)
         _normal_equations(trial, n, fit_sky, pixels, psf, scratch, old, new,
                           chi2)
         if not chi2[0] <= best * (1 + 1e-12) + floor:
@@ -1605,6 +2307,7 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
             damping = max(10 * damping, 1e-3)
             last = 1.0
             continue
+        poor = expected > 1e-9 * best and best - chi2[0] < 0.25 * expected
         parameters[:size] = trial[:size]
         best = chi2[1]
         for source, target in ((new[0], old[0]), (new[1], old[1])):
@@ -1616,7 +2319,10 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
         if damping == 0 and length * min(1.0, length / last) < _STEP_TOLERANCE:
             return _CONVERGED, iteration + 2
         last = length
-        damping = damping / 10 if damping > 1e-5 else 0.0
+        if poor:
+            damping = max(4 * damping, 1e-2)
+        else:
+            damping = damping / 10 if damping > 1e-4 else 0.0
     return _NOT_CONVERGED, max_iterations + 1
 
 
@@ -1628,10 +2334,10 @@ def _covariances(matrix, fixed, n, size, work, out):
     Returns the variance of the last parameter, or NaN if there is no inverse;
     then out is NaN, too.
     """
-    step, _, frozen, scale, factor = work
+    step, _, frozen, scale, factor, steepest = work
     for a in range(size):
         frozen[a] = fixed[a]
-    if not _factorize(matrix, frozen, 0.0, size, scale, factor):
+    if not _factorize(matrix, frozen, 0.0, size, steepest, scale, factor):
         out[:n] = np.nan
         return np.nan
     for a in range(size):
@@ -1737,7 +2443,7 @@ def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
               np.empty(4, np.int64), np.empty((3, 4)))
     scratch = (np.empty((most, 3, area)), np.empty(most, np.bool_), tiling)
     work = (np.empty(size), np.empty(size), np.empty(size, np.bool_),
-            np.empty(size), np.empty((size, size)))
+            np.empty(size), np.empty((size, size)), np.empty(size))
     limits = (np.empty(size), np.empty(size), np.empty(size, np.bool_))
     parameters, chi2 = np.empty(size), np.empty(2)
     for g in range(starts.size - 1):
@@ -1750,11 +2456,10 @@ def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
         if n_pixels < 0:
             outcome[stars, 0] = _BAD_ERROR
             continue
-        longest = max(1.0, 0.25 * np.max(boxes[stars, 2:]))
         pixels = (boxes[stars], data, variance, gain)
         status, evaluations = _minimize(
             parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
-            limits, max_iterations, longest, chi2)
+            limits, max_iterations, chi2)
         sky_variance = _covariances(old[2], limits[2], n, 3 * n + fit_sky,
                                     work, covariances[stars])
         _measure_fit(initial[stars, 1], initial[stars, 2], boxes[stars],
@@ -1858,11 +2563,12 @@ def _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy, at, moves,
 
 @_jit
 def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
-                fit_sky, with_shapes, row, normal):
+                fit_sky, with_shapes, block, normal):
     """
     Sum the normal equations of a stamp into normal; return their size.
 
-    The size includes the column of the residual.
+    The size includes the column of the residual. block is scratch (4, D):
+    four pixels at a time save three of four walks through normal.
     """
     own = 3 * n_sources + fit_sky
     size = own + 1
@@ -1871,22 +2577,40 @@ def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
         size += 6 * rows.shape[0] - 3
         first = own
     normal[:size, :size] = 0.0
+    filled = 0
     for j in range(stamp.shape[0]):
         for i in range(stamp.shape[1]):
             w = weight[j, i]
             if w <= 0:
                 continue
+            row = block[filled]
             row[:size] = 0.0
             if fit_sky:
                 row[own - 1] = 1.0
             model = _design(left + i, bottom + j, rows, sources, n_sources,
                             first, row)
             row[size - 1] = stamp[j, i] - sky - model
+            root = sqrt(w)
             for m in range(size):
-                c = w * row[m]
-                for n in range(m, size):
-                    normal[m, n] += c * row[n]
+                row[m] *= root
+            filled += 1
+            if filled == 4:
+                _add_products(block, size, normal)
+                filled = 0
+    block[filled:, :size] = 0.0
+    _add_products(block, size, normal)
     return size
+
+
+@_jit
+def _add_products(block, size, normal):
+    """Add the products of the columns of block (4, D), upper triangle."""
+    r0, r1, r2, r3 = block[0], block[1], block[2], block[3]
+    for m in range(size):
+        out = normal[m]
+        c0, c1, c2, c3 = r0[m], r1[m], r2[m], r3[m]
+        for n in range(m, size):
+            out[n] += c0 * r0[n] + c1 * r1[n] + c2 * r2[n] + c3 * r3[n]
 
 
 @_jit
@@ -1926,67 +2650,83 @@ def _back_substitute(normal, n, size, step):
 
 
 @_jit
-def _settle(stamp, weight, left, bottom, rows, sources, anchors, hold,
-            n_sources, sky, fit_sky, n_steps, tolerance, row, normal, step):
-    """Fit the stamp's own numbers, its PSF given; return the sky."""
-    own = 3 * n_sources + fit_sky
-    for _ in range(n_steps):
-        size = _accumulate(stamp, weight, left, bottom, rows, sources,
-                           n_sources, sky, fit_sky, False, row, normal)
-        _hold_neighbours(sources, anchors, n_sources, hold, size, normal)
-        gain = normal[size - 1, size - 1]
-        _eliminate(normal, own, size)
-        gain -= normal[size - 1, size - 1]
-        _back_substitute(normal, own, size, step)
-        for j in range(n_sources):
-            for i in range(2):
-                # A longer step would leave the core, where linear is wrong.
-                sources[j, i] += min(max(step[3 * j + i], -0.5), 0.5)
-            sources[j, 2] += step[3 * j + 2]
-        if fit_sky:
-            sky += step[own - 1]
-        if not gain > tolerance:
-            break
+def solve(augmented, step):
+    """
+    Solve a symmetric positive definite system for step (n,).
+
+    augmented (n, n + 1) holds the matrix and the right side; only the upper
+    triangle is read, and destroyed.
+    """
+    n = step.size
+    for k in range(n):
+        pivot = augmented[k, k]
+        if not pivot > 0:
+            continue
+        upper = augmented[k]
+        for i in range(k + 1, n):
+            factor = upper[i] / pivot
+            row = augmented[i]
+            for j in range(i, n + 1):
+                row[j] -= factor * upper[j]
+    _back_substitute(augmented, n, n + 1, step)
+
+
+@_jit
+def _move(sources, n_sources, sky, fit_sky, step):
+    """Add the step to a stamp's own numbers; return the sky."""
+    for j in range(n_sources):
+        for i in range(2):
+            # A longer step would leave the core, where linear is wrong.
+            sources[j, i] += min(max(step[3 * j + i], -0.5), 0.5)
+        sources[j, 2] += step[3 * j + 2]
+    if fit_sky:
+        return sky + step[3 * n_sources]
     return sky
 
 
 @_jit
 def field_normal(stamps, weights, corners, basis, coefficients, sources,
                  anchors, hold, n_sources, sky, fit_sky, used, n_steps,
-                 tolerance, normal, total, gradient, chi2):
+                 normal, total, gradient, chi2):
     """
     Settle n stars and add the equations of the used ones to total, gradient.
+
+    Each star's own numbers take n_steps Gauss-Newton steps, the PSF given;
+    the last one is taken together with the equations of the shapes, so that
+    chi2 (n,) and gradient are those after it.
 
     stamps, weights (n, s, s); corners (n, 2), the pixel (x, y) of each
     stamp's first; basis (n, T); coefficients (T, K, 6); sources, anchors,
     hold (n, M, 3); n_sources (n,); sky (n,) with fit_sky; used (n,). normal
     is scratch (D, D) with D = 3 M + 6 K - 1. total (P T, P T), upper
     triangle, and gradient (P T,) order unknowns by shape, then term, with
-    P = 6 K - 3. chi2 (n,).
+    P = 6 K - 3.
     """
     k = coefficients.shape[1]
     shapes = np.empty((k, 6))
     rows = np.empty((k, 6))
-    row = np.empty(normal.shape[0])
+    block = np.empty((4, normal.shape[0]))
     step = np.empty(normal.shape[0])
     spread = np.empty(gradient.size)
     for star in range(stamps.shape[0]):
         _shapes_at(basis[star], coefficients, shapes)
         shape_rows(shapes, rows)
         left, bottom = corners[star]
-        sky[star] = _settle(
-            stamps[star], weights[star], left, bottom, rows, sources[star],
-            anchors[star], hold[star], n_sources[star], sky[star], fit_sky,
-            n_steps, tolerance, row, normal, step)
-        size = _accumulate(
-            stamps[star], weights[star], left, bottom, rows, sources[star],
-            n_sources[star], sky[star], fit_sky, used[star], row, normal)
-        _hold_neighbours(sources[star], anchors[star], n_sources[star],
-                         hold[star], size, normal)
+        own = 3 * n_sources[star] + fit_sky
+        for i in range(n_steps):
+            last = used[star] and i == n_steps - 1
+            size = _accumulate(
+                stamps[star], weights[star], left, bottom, rows,
+                sources[star], n_sources[star], sky[star], fit_sky, last,
+                block, normal)
+            _hold_neighbours(sources[star], anchors[star], n_sources[star],
+                             hold[star], size, normal)
+            _eliminate(normal, own, size)
+            _back_substitute(normal, own, size, step)
+            sky[star] = _move(sources[star], n_sources[star], sky[star],
+                              fit_sky, step)
         chi2[star] = normal[size - 1, size - 1]
         if used[star]:
-            own = 3 * n_sources[star] + fit_sky
-            _eliminate(normal, own, size)
             _spread(normal, own, size, basis[star], spread, total, gradient)
 
 
