@@ -154,7 +154,7 @@ def _rename(frame, name, taken):
     while new in taken:
         k += 1
         new = f'{name}_unaligned{k}'
-    frame._name = new  # noqa: SLF001 frames have no public setter
+    frame._name = new
 
 
 def _largest_angle(one, other):

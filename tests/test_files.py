@@ -249,7 +249,7 @@ def test_asdf_finds_the_package_by_its_entry_points(tmp_path):
     psf.write(tmp_path / 'a.asdf')
     asdf.AsdfFile({'a': 3}).write_to(tmp_path / 'b.asdf')
     install(tmp_path)
-    code = f'''
+    code = f"""
 import sys, asdf
 sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]
 asdf.open({str(tmp_path / 'b.asdf')!r}).close()
@@ -258,7 +258,7 @@ assert not heavy & set(sys.modules), heavy & set(sys.modules)
 with asdf.open({str(tmp_path / 'a.asdf')!r}) as file:
     print(file['psf'])
     assert 'photutils_mgauss.gridded' in sys.modules
-'''
+"""
     out = subprocess.run([sys.executable, '-W', 'error::UserWarning', '-c',
                           code], check=True, capture_output=True, text=True)
     assert 'GriddedMixturePSF' in out.stdout

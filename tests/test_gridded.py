@@ -311,7 +311,7 @@ def test_negative_weights_cannot_be_matched():
                              [np.eye(2), 2 * np.eye(2)])
     with pytest.raises(ValueError, match="must be 'blend' where weights are"):
         GriddedMixturePSF([signed], [(0, 0)], interpolation='components')
-    with pytest.raises(ValueError, match="interpolation must be one of"):
+    with pytest.raises(ValueError, match='interpolation must be one of'):
         GriddedMixturePSF([signed], [(0, 0)], interpolation='linear')
 
 
