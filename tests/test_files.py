@@ -144,8 +144,8 @@ def test_any_fits_tool_can_read_the_tables(tmp_path):
 @pytest.mark.parametrize('name', ['a.fits', 'a.asdf'])
 def test_a_file_of_another_class_is_refused(name, tmp_path):
     some_mixture(np.random.default_rng(1)).write(tmp_path / name)
-    with pytest.raises(ValueError, match='must hold a GriddedMixturePSF, got '
-                       '.* with GaussianMixture'):
+    with pytest.raises(ValueError, match=r'must hold a GriddedMixturePSF, got '
+                       r'.* with GaussianMixture'):
         GriddedMixturePSF.read(tmp_path / name)
 
 
@@ -200,7 +200,7 @@ def test_a_changed_byte_in_fits_is_noticed(tmp_path):
     content = bytearray((tmp_path / 'a.fits').read_bytes())
     content[where] ^= 1
     (tmp_path / 'a.fits').write_bytes(content)
-    with pytest.raises(ValueError, match='(?i)undamaged, got .*checksum'):
+    with pytest.raises(ValueError, match=r'(?i)undamaged, got .*checksum'):
         GriddedMixturePSF.read(tmp_path / 'a.fits')
 
 
