@@ -209,14 +209,12 @@ class Detections:
     """
     What an epoch says about each of its n rows, as plain arrays.
 
-    ``vectors`` (3, n) are ICRS directions, or None for a plane without sky.
     ``plane`` (2, n) and ``covariance`` (3, n: xx, xy, yy) are in the frame's
     unit, mas or pixels. ``found`` says which positions are finite,
     ``usable`` which errors are good as well.
     """
 
     ids: np.ndarray | None
-    vectors: np.ndarray | None
     plane: np.ndarray
     covariance: np.ndarray
     years: np.ndarray
@@ -302,8 +300,8 @@ def read_epoch(epoch, plane=None, vectors=None):
     found &= np.isfinite(years)
     positions = np.where(found, positions, np.nan)
     usable = found & _positive_definite(covariance)
-    return Detections(_ids(epoch.table), vectors, positions, covariance,
-                      years, _flux(epoch.table), found, usable)
+    return Detections(_ids(epoch.table), positions, covariance, years,
+                      _flux(epoch.table), found, usable)
 
 
 def _read_plane(epoch):
