@@ -846,7 +846,7 @@ def render_matched_image(x, y, flux, sums, x_grid, y_grid, integrated,
                          faintest, left, bottom, out):
     """Add stars as `render_image` does, with matched Gaussians blended."""
     rows = np.empty(sums.shape[1:])
-    slopes = np.empty((2,) + sums.shape[1:])
+    slopes = np.empty((2, *sums.shape[1:]))
     scratch = np.empty((3, _ERRORS.size))
     for i in range(x.size):
         match_rows(x[i], y[i], sums, x_grid, y_grid, rows, slopes)
@@ -2697,7 +2697,7 @@ def solve(augmented, step):
 
 
 @_jit
-def _move(sources, n_sources, sky, fit_sky, step):
+def _move_sources(sources, n_sources, sky, fit_sky, step):
     """Add the step to a stamp's own numbers; return the sky."""
     for j in range(n_sources):
         for i in range(2):
@@ -2748,8 +2748,8 @@ def field_normal(stamps, weights, corners, basis, coefficients, sources,
                              hold[star], size, normal)
             _eliminate(normal, own, size)
             _back_substitute(normal, own, size, step)
-            sky[star] = _move(sources[star], n_sources[star], sky[star],
-                              fit_sky, step)
+            sky[star] = _move_sources(sources[star], n_sources[star],
+                                      sky[star], fit_sky, step)
         chi2[star] = normal[size - 1, size - 1]
         if used[star]:
             _spread(normal, own, size, basis[star], spread, total, gradient)

@@ -240,7 +240,8 @@ def _laid_out(psf, layout):
     missing = [name for name in psfs if name not in layout]
     if missing:
         words = ', '.join(map(repr, missing))
-        msg = f'layout must have a place for every detector, got none for {words}'
+        msg = ('layout must have a place for every detector, got none for '
+               f'{words}')
         raise ValueError(msg)
     return psfs, layout
 
