@@ -29,8 +29,8 @@ from photutils_mgauss import _kernels
 _PRIOR_CONSTANT = np.array([2.0, 1.0, 1.0, 0.7, 0.7, 0.7])
 _PRIOR_VARIATION = np.array([0.7, 0.4, 0.4, 0.3, 0.3, 0.3])
 
-_SETTLE_STEPS = 4
-_SETTLE_TOLERANCE = 1e-4
+# Gauss-Newton steps of the stamps' own numbers for each step of the shapes.
+_SETTLE_STEPS = 2
 
 
 @dataclass
@@ -159,7 +159,7 @@ class _PartEquations:
         _kernels.field_normal(
             data, weights, corners, basis, self.coefficients, sources,
             anchors, hold, n_sources, sky, self.fit_sky, used, _SETTLE_STEPS,
-            _SETTLE_TOLERANCE, np.empty((n, n)), total, right, chi2)
+            np.empty((n, n)), total, right, chi2)
         return Equations(total, right, chi2, sources, sky)
 
 
@@ -232,26 +232,30 @@ def optimise(problem, coefficients, prior, workers, *, max_steps=30,
     n_terms, k, _ = coefficients.shape
     present = equations(problem, coefficients, workers)
     cost = _cost(problem, present, prior, coefficients)
-    damping = 1e-3
-    curvature = to_vector(prior.precision)
+    damping, growth = 1e-3, 2.0
+    curvature = np.diag(to_vector(prior.precision))
     for _ in range(max_steps):
         problem.sources, problem.sky = present.sources, present.sky
-        matrix = present.matrix + np.diag(curvature)
-        step = _damped_step(matrix, present.right + prior.right(coefficients),
-                            damping)
+        matrix = present.matrix + curvature
+        right = present.right + prior.right(coefficients)
+        step = _damped_step(matrix, right, damping)
+        expected = step @ (2 * right - matrix @ step)
         trial = coefficients + to_coefficients(step, n_terms, k)
         new = equations(problem, trial, workers)
-        new_cost = _cost(problem, new, prior, trial)
-        if new_cost < cost:
-            gain, cost = cost - new_cost, new_cost
-            coefficients, present = trial, new
-            damping = max(damping / 8, 1e-9)
-            if gain < tolerance * problem.used.sum():
+        gain = cost - _cost(problem, new, prior, trial)
+        if gain > 0:
+            coefficients, present, cost = trial, new, cost - gain
+            # The damping follows how well the gain was foreseen.
+            share = min(gain / expected, 1.0)
+            damping *= max(1 / 5, 1 - (2 * share - 1) ** 3)
+            growth = 2.0
+            if max(gain, expected) < tolerance * problem.used.sum():
                 break
         elif damping > 1e6:
             break
         else:
-            damping *= 8
+            damping *= growth
+            growth *= 2
     problem.sources, problem.sky = present.sources, present.sky
     return coefficients, present
 
@@ -265,7 +269,7 @@ def _damped_step(matrix, right, damping):
     scale = np.sqrt(np.diag(matrix))
     scaled = matrix / scale / scale[:, None]
     scaled[np.diag_indices_from(scaled)] += damping
-    try:
-        return np.linalg.solve(scaled, right / scale) / scale
-    except np.linalg.LinAlgError:
-        return np.zeros_like(right)
+    # Not LAPACK: its own threads wait for each other on a busy machine.
+    step = np.empty(right.size)
+    _kernels.solve(np.column_stack([scaled, right / scale]), step)
+    return step / scale

@@ -16,7 +16,7 @@ from photutils_mgauss._field_fit import (
 )
 
 # Stars used while the degree is low: enough for its few coefficients.
-_START_STARS = 60
+_START_STARS = 40
 _STARS_PER_TERM = 40
 # A pixel is deviant beyond this many standard deviations.
 _PIXEL_LIMIT = 5.0
@@ -196,7 +196,7 @@ def _reject(state, residual, variance):
     chi2 = np.nansum(np.where(kept, pulls**2, 0), axis=(1, 2))
     reduced = chi2 / np.maximum(kept.sum(axis=(1, 2)), 1)
     share = state.deviant_pixels.sum(axis=(1, 2)) / good.sum(axis=(1, 2))
-    used = _not_deviant(reduced, problem.used)
+    used = not_deviant(reduced, problem.used)
     used &= share <= _MAX_DEVIANT_PIXELS
     used &= problem.sources[:, 0, 2] > 0
     middle = problem.stamps.corners + problem.stamps.radius
@@ -220,7 +220,8 @@ def _deviant_pixels(pulls, used):
     return np.abs(np.nan_to_num(pulls)) > limit
 
 
-def _not_deviant(reduced, used):
+def not_deviant(reduced, used):
+    """Return which stars' reduced chi^2 is like that of the used ones."""
     middle = np.median(reduced[used])
     scatter = 1.4826 * np.median(np.abs(reduced[used] - middle))
     limit = middle + max(_STAR_LIMIT * scatter, _STAR_EXCESS * middle)
@@ -233,15 +234,27 @@ def run(problem, n_components, degree, workers, *, strength=1.0, reject=True):
 
     ``problem.basis`` holds the terms of ``degree``. Returns a `FieldFit`.
     """
-    start, shapes, width = begin(problem, n_components, strength, workers)
-    prior = Prior.about(shapes, n_terms(degree), width, strength)
-    state = FieldFit(problem, start, prior, None, _FIRST_ACCURACY,
-                     np.zeros(problem.stamps.good.shape, bool))
+    state = _first_state(problem, n_components, degree, strength, workers)
     brightest = np.argsort(-problem.sources[:, 0, 2])
     for low in range(degree):
         count = _STARS_PER_TERM * n_terms(low + 1)
         _stage(state, np.sort(brightest[:count]), low, workers, reject)
     return _finish(state, degree, workers, reject)
+
+
+def degrees(problem, n_components, top, strength, workers):
+    """Yield the coefficients of each degree from 0 to the top one."""
+    state = _first_state(problem, n_components, top, strength, workers)
+    for degree in range(top + 1):
+        _stage(state, np.arange(len(problem.basis)), degree, workers, True)
+        yield state.coefficients
+
+
+def _first_state(problem, n_components, degree, strength, workers):
+    start, shapes, width = begin(problem, n_components, strength, workers)
+    prior = Prior.about(shapes, n_terms(degree), width, strength)
+    return FieldFit(problem, start, prior, None, _FIRST_ACCURACY,
+                    np.zeros(problem.stamps.good.shape, bool))
 
 
 def _stage(state, index, degree, workers, reject):
@@ -255,7 +268,7 @@ def _stage(state, index, degree, workers, reject):
     _settle_all(part, workers)
     for _ in range(2):
         weigh(part, reject=reject, share=0.5)
-        advance(part, workers, tolerance=0.1, max_steps=10)
+        advance(part, workers, tolerance=0.3, max_steps=10)
     state.coefficients, state.accuracy = part.coefficients, part.accuracy
 
 
@@ -270,7 +283,7 @@ def _finish(state, degree, workers, reject):
     terms = n_terms(degree)
     state.coefficients = _raised(state.coefficients, terms)
     _settle_all(state, workers)
-    for share, tolerance in ((0.3, 0.1), (0.3, 0.1), (0.5, 0.01), (1, 1e-3)):
+    for share, tolerance in ((0.3, 0.3), (0.3, 0.1), (1, 0.01)):
         weigh(state, reject=reject, share=share)
         advance(state, workers, tolerance=tolerance)
     return state

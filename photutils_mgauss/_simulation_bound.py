@@ -17,8 +17,8 @@ import numpy as np
 from astropy.table import QTable
 from astropy.time import Time
 
-from photutils_mgauss import _kernels
 from photutils_mgauss._parallel import map_chunks
+from photutils_mgauss._simulation_brush import brush_of
 
 # Half the side of the stamps, and the step of the derivatives [pix].
 _HALF = 7
@@ -59,15 +59,17 @@ def covariances(psf, x, y, flux, variance, executor):
 
     ``variance`` is that of a pixel without the star [electron^2].
     """
+    brush = brush_of(psf)
+
     def bounds(xs, ys, fluxes):
-        return [_bound(psf, *star, variance)
+        return [_bound(brush, *star, variance)
                 for star in zip(xs, ys, fluxes, strict=True)]
     return np.array(map_chunks(bounds, (x, y, flux), executor,
                                chunk_size=64)).reshape(-1, 3, 3)
 
 
-def _bound(psf, x, y, flux, variance):
-    star, *derivatives = _derivatives(psf, x, y, flux)
+def _bound(brush, x, y, flux, variance):
+    star, *derivatives = _derivatives(brush, x, y, flux)
     weight = 1 / (variance + star)
     jacobian = np.stack(derivatives)
     fisher = np.einsum('iyx,jyx,yx->ij', jacobian, jacobian, weight)
@@ -77,22 +79,19 @@ def _bound(psf, x, y, flux, variance):
             * np.outer(scale, scale))
 
 
-def _derivatives(psf, x, y, flux):
+def _derivatives(brush, x, y, flux):
     """Return the stamp of a star and its derivatives by x, y and flux."""
     h = _STEP
     moved = [(x, y), (x + h, y), (x - h, y), (x, y + h), (x, y - h)]
-    star, right, left, up, down = (_stamp(psf, *place, flux, x, y)
+    star, right, left, up, down = (_stamp(brush, *place, flux, x, y)
                                    for place in moved)
     return star, (right - left) / (2 * h), (up - down) / (2 * h), star / flux
 
 
-def _stamp(psf, x, y, flux, x_centre, y_centre):
+def _stamp(brush, x, y, flux, x_centre, y_centre):
     out = np.zeros((2 * _HALF + 1, 2 * _HALF + 1))
-    grid = psf._grid
-    _kernels.render_image(
-        np.array([x]), np.array([y]), np.array([flux]), grid.rows,
-        grid.x_grid, grid.y_grid, psf.pixel_integrated, 1e-5 * flux,
-        np.rint(x_centre) - _HALF, np.rint(y_centre) - _HALF, out)
+    brush.add(np.array([[x], [y], [flux]]), 1e-5 * flux,
+              np.rint(x_centre) - _HALF, np.rint(y_centre) - _HALF, out)
     return out
 
 

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from photutils_mgauss import _kernels
+from photutils_mgauss._brighter_fatter import shoot_stars
 from photutils_mgauss._detector_effects import (
     SATURATED,
     DetectorEffects,
@@ -20,6 +20,7 @@ from photutils_mgauss._detector_effects import (
     respond,
 )
 from photutils_mgauss._parallel import available_cores
+from photutils_mgauss._simulation_brush import brush_of
 from photutils_mgauss._simulation_instrument import Instrument
 from photutils_mgauss._simulation_sky import Exposure
 
@@ -33,10 +34,10 @@ FAINTEST = 1e-3
 
 def draw(psf, x, y, flux, shape, faintest, executor):
     """Return the light (ny, nx) of stars."""
-    bands = row_bands(shape)
+    bands, brush = row_bands(shape), brush_of(psf)
     image = np.empty(shape)
-    parts = _run(partial(_render, psf, shape[1], faintest), executor, bands,
-                 _split(psf, x, y, flux, bands, faintest))
+    parts = _run(partial(_render, brush, shape[1], faintest), executor, bands,
+                 _split(brush, x, y, flux, bands, faintest))
     for band, part in zip(bands, parts, strict=True):
         image[band] = part
     return image
@@ -58,13 +59,13 @@ def _run(function, executor, *columns):
         yield from pool.map(function, *columns)
 
 
-def _split(psf, x, y, flux, bands, faintest):
+def _split(brush, x, y, flux, bands, faintest):
     """Yield, for each band, the stars (3, n) that may reach it."""
     # By y, so that each band finds its stars, and the sum over stars in
     # each pixel has one order.
     order = np.argsort(y, kind='stable')
     stars = np.stack([x, y, flux])[:, order]
-    reach = _reach(psf._grid.rows, stars[2], faintest)
+    reach = brush.reach(stars[2], faintest)
     farthest = reach.max(initial=0)
     for band in bands:
         first, last = np.searchsorted(
@@ -75,27 +76,10 @@ def _split(psf, x, y, flux, bands, faintest):
         yield stars[:, near][:, distance <= reach[near]]
 
 
-def _reach(rows, flux, faintest):
-    """Return how far along y a star of each flux can be drawn (n,) [pix]."""
-    peak = np.abs(rows[..., 0]).max(axis=0)
-    stddev = 1 / np.sqrt(rows[..., 5].min(axis=0))
-    offset = np.abs(rows[..., 2]).max()
-    reach = np.zeros_like(flux)
-    for height, sigma in zip(peak, stddev, strict=True):
-        ratio = np.maximum(np.abs(flux) * height / faintest,
-                           1 / _kernels._DEPTH)
-        reach = np.maximum(reach, sigma * np.sqrt(2 * np.log(ratio)))
-    return reach + offset + 1
-
-
-def _render(psf, width, faintest, band, stars):
+def _render(brush, width, faintest, band, stars):
     """Return the expected light (rows, width) of stars in a band of rows."""
     out = np.zeros((band.stop - band.start, width))
-    grid = psf._grid
-    x, y, flux = np.ascontiguousarray(stars)
-    _kernels.render_image(x, y, flux, grid.rows, grid.x_grid, grid.y_grid,
-                          psf.pixel_integrated, faintest, 0.0,
-                          float(band.start), out)
+    brush.add(stars, faintest, 0, band.start, out)
     return out
 
 
@@ -126,13 +110,19 @@ class Chip:
 def expose(chip, truth, psf, rng, executor):
     """Return the electrons in each pixel, at most a full well, and flags."""
     x, y, flux = (truth[name].value for name in ('x', 'y', 'flux'))
+    brush = brush_of(psf)
     electrons = np.empty(chip.instrument.shape, np.float32)
     flags = np.empty(chip.instrument.shape, np.uint8)
-    parts = _run(partial(_expose_band, chip, psf), executor, chip.bands,
-                 _split(psf, x, y, flux, chip.bands, FAINTEST),
-                 rng.spawn(len(chip.bands)))
+    repel = chip.effects.brighter_fatter
+    stars = _split(brush, x, y, 0 * flux if repel else flux, chip.bands,
+                   FAINTEST)
+    parts = _run(partial(_expose_band, chip, brush), executor, chip.bands,
+                 stars, rng.spawn(len(chip.bands)))
     for band, part in zip(chip.bands, parts, strict=True):
         electrons[band], flags[band] = part
+    if repel:
+        electrons += shoot_stars(psf, x, y, flux, chip.instrument.shape,
+                                 repel, rng)
     add_cosmic_rays(electrons, flags, chip.effects,
                     chip.instrument.exposure_time, rng)
     full_well = chip.instrument.full_well
@@ -143,10 +133,10 @@ def expose(chip, truth, psf, rng, executor):
     return electrons, flags
 
 
-def _expose_band(chip, psf, band, stars, rng):
+def _expose_band(chip, brush, band, stars, rng):
     """Return the electrons and flags of a band of rows."""
     instrument, fixed = chip.instrument, chip.pattern(band)
-    expected = _render(psf, instrument.shape[1], FAINTEST, band, stars)
+    expected = _render(brush, instrument.shape[1], FAINTEST, band, stars)
     expected += chip.sky
     expected *= fixed.response
     expected += instrument.dark_level

@@ -6,7 +6,6 @@ by Levenberg-Marquardt in compiled code; what photutils adds around that
 (tables, units, flags) is not here.
 """
 import itertools
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,6 +13,7 @@ from functools import partial
 import numpy as np
 
 from photutils_mgauss import _kernels
+from photutils_mgauss._parallel import available_cores
 from photutils_mgauss.gridded import GriddedMixturePSF
 from photutils_mgauss.model import MultiGaussianPSFModel
 
@@ -272,12 +272,6 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
         return Fits.joined([work(chunk) for chunk in chunks])
     with ThreadPoolExecutor(n_threads) as pool:
         return Fits.joined(_map_cancelling(pool, work, chunks))
-
-
-def available_cores():
-    """Return on how many cores this process may run."""
-    return (len(os.sched_getaffinity(0))
-            if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1)
 
 
 def _map_cancelling(executor, function, arguments):

@@ -20,12 +20,14 @@ from astropy.table import QTable
 from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss import _field_stages as stages
+from photutils_mgauss._field_choice import DEGREES, choose
 from photutils_mgauss._field_fit import (
     Problem,
     Workers,
     model_stamps,
     to_vector,
 )
+from photutils_mgauss._files import storable, table_columns
 from photutils_mgauss._star_stamps import cut_stamps, remove_star_noise
 from photutils_mgauss._tables import as_image, read_sources
 from photutils_mgauss._validation import as_integer, as_real, as_shape
@@ -41,6 +43,10 @@ _MAX_NEIGHBOURS = 12
 _STARS_PER_TERM = 2
 
 
+@storable(detector={'ny': 'pix', 'nx': 'pix', 'radius': 'pix',
+                    'accuracy': ''},
+          terms={'coefficient': ''}, errors={'covariance': ''},
+          stars={'x': 'pix', 'y': 'pix', 'used': ''}, dropped={'id': ''})
 @dataclass(frozen=True, eq=False, repr=False)
 class MixtureField:
     r"""
@@ -79,6 +85,9 @@ class MixtureField:
         The relative error of the PSF that the stars' chi^2 asks for.
     dropped : `~astropy.table.QTable`
         ``id`` and ``reason`` of the stars that were not used.
+    choice : `~astropy.table.QTable`
+        The reduced chi^2 of left-out stars for each ``n_components`` and
+        ``degree`` that was tried; empty if none was left to choose.
     """
 
     coefficients: np.ndarray
@@ -89,12 +98,40 @@ class MixtureField:
     residual_stars: np.ndarray = field(default=None)
     accuracy: float = 0.0
     dropped: QTable = field(default=None)
+    choice: QTable = field(default=None)
 
     def __repr__(self):
         used = int(np.count_nonzero(self.stars['used']))
         return (f'<MixtureField(n_components={self.n_components}, '
                 f'degree={self.degree}, shape={self.shape}, '
                 f'{used} of {len(self.stars)} stars)>')
+
+    def _to_tables(self):
+        ny, nx = self.shape
+        stars = table_columns(self.stars)
+        if self.residual_stars is not None:
+            stars['residual'] = self.residual_stars
+        dropped = _dropped(np.array([], str)) if (
+            self.dropped is None) else self.dropped
+        return {'detector': {'ny': [ny], 'nx': [nx],
+                             'radius': [float(self.radius)],
+                             'accuracy': [float(self.accuracy)]},
+                'terms': {'coefficient': self.coefficients},
+                'errors': {'covariance': self.covariance},
+                'stars': stars, 'dropped': table_columns(dropped)}
+
+    @classmethod
+    def _from_tables(cls, tables):
+        detector, stars = tables['detector'], dict(tables['stars'])
+        coefficients = tables['terms']['coefficient']
+        covariance = tables['errors']['covariance']
+        n_terms, n = len(coefficients), len(covariance)
+        residual = stars.pop('residual', None)
+        return cls(coefficients.reshape(n_terms, -1, 6),
+                   (int(detector['ny'][0]), int(detector['nx'][0])),
+                   float(detector['radius'][0]), covariance.reshape(n, n),
+                   QTable(stars), residual, float(detector['accuracy'][0]),
+                   QTable(tables['dropped']))
 
     @property
     def n_components(self):
@@ -247,11 +284,13 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=5,
     mask : (ny, nx) array_like of bool, optional
         True for pixels to leave out. Pixels that are not finite, or whose
         error is not positive, are left out, too.
-    n_components : int, optional
-        The number K of Gaussians.
-    degree : int, optional
+    n_components : int or 'auto', optional
+        The number K of Gaussians; 'auto' tries 2 to 6 and keeps the number
+        that describes stars left out of the fit best.
+    degree : int or 'auto', optional
         The degree of the polynomials, 0 for a PSF that is the same
         everywhere. It is lowered, with a warning, if there are too few stars.
+        'auto' tries 0 to 5 in the same way.
     radius : float, optional
         The radius of the circle of pixels that is fitted [pix].
     local_bkg : bool, optional
@@ -293,20 +332,31 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=5,
     array([[2. , 0.3],
            [0.3, 1.5]])
     """
-    n_components = as_integer(n_components, 'n_components', minimum=1)
-    degree = as_integer(degree, 'degree', minimum=0)
+    n_components = _number(n_components, 'n_components', 1)
+    degree = _number(degree, 'degree', 0)
     radius = as_real(radius, 'radius', minimum=2)
     strength = as_real(regularization, 'regularization', above=0)
     data, error, mask = _images(data, error, mask)
     sources = read_sources(stars)
     stamps, index, reasons = _usable_stamps(data, error, mask, sources,
                                             radius, effective_gain)
-    degree = _possible_degree(degree, len(index))
-    problem = _problem(stamps, sources, index, data.shape, degree, local_bkg)
+    top = _possible_degree(degree, len(index))
+    degree = degree if degree == 'auto' else top
+    problem = _problem(stamps, sources, index, data.shape, top, local_bkg)
     with Workers(executor) as workers:
+        n_components, degree, choice = choose(problem, n_components, degree,
+                                              top, strength, workers)
+        problem.basis = np.ascontiguousarray(
+            problem.basis[:, :stages.n_terms(degree)])
         fit = stages.run(problem, n_components, degree, workers,
                          strength=strength, reject=reject)
-    return _result(fit, sources, index, reasons, data.shape, radius)
+    return _result(fit, sources, index, reasons, data.shape, radius, choice)
+
+
+def _number(value, name, minimum):
+    if isinstance(value, str) and value == 'auto':
+        return value
+    return as_integer(value, name, minimum=minimum)
 
 
 def _images(data, error, mask):
@@ -353,6 +403,10 @@ def _estimate_noise(stamps, data):
 
 
 def _possible_degree(degree, n_stars):
+    if degree == 'auto':
+        # A third of the stars is left out while the degree is chosen.
+        return max(d for d in DEGREES
+                   if d == 0 or 2 * n_stars // 3 >= _stars_needed(d))
     needed = _stars_needed(degree)
     if n_stars >= needed:
         return degree
@@ -407,7 +461,7 @@ def _with_neighbours(sources, index, stamps):
     return table, count
 
 
-def _result(fit, sources, index, reasons, shape, radius):
+def _result(fit, sources, index, reasons, shape, radius, choice):
     matrix = fit.equations.matrix + np.diag(
         to_vector(fit.prior.precision))
     covariance = np.linalg.inv(matrix)
@@ -417,7 +471,7 @@ def _result(fit, sources, index, reasons, shape, radius):
     return MixtureField(
         fit.coefficients, shape, radius, covariance,
         _star_table(fit, sources, index, reasons), residual, fit.accuracy,
-        _dropped(reasons))
+        _dropped(reasons), choice)
 
 
 def _dropped(reasons):

@@ -232,9 +232,10 @@ def _minimize(problem, max_steps):
     values = np.clip(problem.start[problem.free], problem.lower,
                      problem.upper)
     state = problem.evaluate(values)
-    damping, last = 0.0, 1.0
+    damping, last, steepest = 0.0, 1.0, np.zeros(values.size)
     for n in range(max_steps):
-        step = _bounded_step(problem, state, damping)
+        steepest = np.maximum(steepest, np.diag(state.matrix))
+        step = _bounded_step(problem, state, damping * steepest)
         if step is None:
             damping = max(10 * damping, 1e-6)
             continue
@@ -245,17 +246,29 @@ def _minimize(problem, max_steps):
                 return state, 2, n + 2
             damping, last = max(10 * damping, 1e-3), 1.0
             continue
+        expected = step @ (2 * state.gradient - state.matrix @ step)
+        poor = (expected > 1e-9 * state.chi2
+                and state.chi2 - new.chi2 < 0.25 * expected)
         state = new
         # Convergence is linear at the worst, see the next step's length.
         if damping == 0 and length * min(1.0, length / last) < _TOLERANCE:
             return state, 3, n + 2
         last = length
-        damping = damping / 10 if damping > 1e-5 else 0.0
+        if poor:
+            damping = max(4 * damping, 1e-2)
+        else:
+            damping = damping / 10 if damping > 1e-4 else 0.0
     return state, 0, max_steps + 1
 
 
 def _bounded_step(problem, state, damping):
-    """Return a step that stays within bounds, or None if it is singular."""
+    """
+    Return a step that stays within bounds, or None if it is singular.
+
+    damping (n,) is added to the diagonal of the matrix. It is in units of
+    the largest diagonal so far: as a star gets faint its position must not
+    become free to run away.
+    """
     low = (state.values <= problem.lower) & (state.gradient < 0)
     high = (state.values >= problem.upper) & (state.gradient > 0)
     moves = ~(low | high) & (np.diag(state.matrix) > 0)
@@ -263,7 +276,7 @@ def _bounded_step(problem, state, damping):
     if moves.any():
         scale = state.scale[moves]
         matrix = state.matrix[np.ix_(moves, moves)] / np.outer(scale, scale)
-        matrix[np.diag_indices_from(matrix)] += damping
+        matrix[np.diag_indices_from(matrix)] += (damping[moves] / scale**2)
         try:
             factor = np.linalg.cholesky(matrix)
         except np.linalg.LinAlgError:

@@ -21,6 +21,7 @@ from photutils_mgauss._simulation_bound import (
     covariances,
     draw_table,
 )
+from photutils_mgauss._simulation_brush import brush_of, widen
 from photutils_mgauss._simulation_catalogues import (
     PAPER_DENSITY,
     crowded_field,
@@ -33,6 +34,7 @@ from photutils_mgauss._simulation_instrument import (
     Band,
     Instrument,
 )
+from photutils_mgauss._simulation_optics import Optics
 from photutils_mgauss._simulation_psf import csst_psf
 from photutils_mgauss._simulation_sky import Exposure, paper_exposures
 from photutils_mgauss._validation import as_floats, as_real, as_shape
@@ -40,9 +42,9 @@ from photutils_mgauss.gridded import GriddedMixturePSF
 
 __all__ = [
     'CSST_BANDS', 'PAPER_DENSITY', 'Band', 'DetectorEffects', 'Exposure',
-    'Instrument', 'Scene', 'SimulatedCatalogue', 'crowded_field', 'csst_psf',
-    'paper_exposures', 'render_stars', 'simulate', 'simulate_catalogues',
-    'simulate_epochs', 'sky_field', 'sparse_field']
+    'Instrument', 'Optics', 'Scene', 'SimulatedCatalogue', 'crowded_field',
+    'csst_psf', 'paper_exposures', 'render_stars', 'simulate',
+    'simulate_catalogues', 'simulate_epochs', 'sky_field', 'sparse_field']
 
 # Sources farther than this from the image are not part of its truth [pix].
 _MARGIN = 64
@@ -67,7 +69,7 @@ class Scene:
         The sources on the image and close to it: ``id``, ``x``, ``y``
         [pix], ``flux`` [electron], ``mag``, ``inside``, and the other
         columns of the catalogue.
-    psf : GriddedMixturePSF
+    psf : GriddedMixturePSF or `~photutils.psf.GriddedPSFModel`
         The true PSF.
     background : float
         The sky in each pixel [electron].
@@ -169,7 +171,7 @@ def simulate(sources, exposure=None, *, instrument=None, psf=None,
         When, where and in which band; by default `Exposure()`.
     instrument : Instrument, optional
         The camera; its ``shape`` is the size of the image.
-    psf : GriddedMixturePSF, optional
+    psf : GriddedMixturePSF or `~photutils.psf.GriddedPSFModel`, optional
         The PSF; by default the `csst_psf` of the band and detector.
     effects : DetectorEffects, optional
         The imperfections of the detector; by default it has none.
@@ -203,7 +205,7 @@ def simulate(sources, exposure=None, *, instrument=None, psf=None,
     if psf is None:
         psf, = _each_psf(None, [exposure], instrument)
     effects = DetectorEffects() if effects is None else effects
-    psf = effects.widen(psf)
+    psf = widen(psf, effects.charge_diffusion)
     wcs = exposure.wcs(instrument.shape, instrument.pixel_scale)
     truth = _truth(sources, exposure, instrument, wcs)
     chip = Chip(instrument, effects, exposure)
@@ -226,7 +228,7 @@ def simulate_epochs(sources, exposures, *, instrument=None, psfs=None,
         For example those of `paper_exposures`.
     instrument, effects, executor
         As for `simulate`.
-    psfs : sequence of GriddedMixturePSF, optional
+    psfs : sequence, optional
         The PSF of each exposure; by default the `csst_psf` of its band and
         detector.
     rng : int or `~numpy.random.Generator`
@@ -316,8 +318,7 @@ def _catalogue(sources, exposure, instrument, psf, threshold, rng, executor):
     truth = _truth(sources, exposure, instrument, wcs)
     sky = instrument.sky(exposure.band)
     flux = truth['flux'].value
-    peak = np.array([m.evaluate(0, 0, pixel_integrated=psf.pixel_integrated)
-                     for m in psf.mixtures]).max()
+    peak = brush_of(psf).peak
     truth = truth[truth['inside'] & (flux > 0)
                   & (flux * peak + sky < instrument.full_well)]
     bounds = covariances(
@@ -348,7 +349,7 @@ def render_stars(psf, x, y, flux, shape, *, faintest=1e-3, executor=None):
 
     Parameters
     ----------
-    psf : GriddedMixturePSF
+    psf : GriddedMixturePSF or `~photutils.psf.GriddedPSFModel`
         The PSF.
     x, y, flux : (n,) array_like
         Positions [pix] and fluxes. Stars may be outside the image.

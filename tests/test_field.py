@@ -295,3 +295,14 @@ def test_the_nine_stars_of_daophots_image_are_found(realdata):
     dx, dy = field.stars['x_fit'] - x, field.stars['y_fit'] - y
     for offset in (dx, dy):
         assert np.sqrt(np.mean((offset - np.mean(offset)) ** 2)) < 0.04
+
+
+def test_left_out_stars_choose_degree_and_number_of_gaussians(stars, clean):
+    data, error, _ = noisy(clean, np.random.default_rng(5))
+    field = fit_mixture_field(data, stars[::2], error=error,
+                              n_components='auto', degree='auto', radius=6)
+    # The truth: two Gaussians, linear in position.
+    assert field.n_components in (2, 3)
+    assert field.degree in (1, 2)
+    scores = field.choice['reduced_chi2']
+    assert scores[field.choice['degree'] == 0].min() > scores.min()
