@@ -228,6 +228,42 @@ class MotionSolution:
         n = as_integer(n_resamples, 'n_resamples', minimum=1)
         return bootstrap_frames(self._fit, n, rng)
 
+    def plot_residuals(self, ax, epoch):
+        """
+        Draw the residuals of one epoch as arrows.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`
+            Where to draw.
+        epoch : int
+            Number of the epoch, from 0.
+
+        Returns
+        -------
+        `~matplotlib.axes.Axes`
+            The same.
+        """
+        from photutils_mgauss.plotting import plot_residual_vectors
+        return plot_residual_vectors(ax, self, epoch)
+
+    def plot_motions(self, ax):
+        """
+        Plot the proper-motion diagram.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`
+            Where to draw.
+
+        Returns
+        -------
+        `~matplotlib.axes.Axes`
+            The same.
+        """
+        from photutils_mgauss.plotting import plot_proper_motions
+        return plot_proper_motions(ax, self.stars)
+
     @property
     def _year(self):
         return float(self.stars['ref_epoch'][0].value)

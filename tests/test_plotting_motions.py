@@ -1,0 +1,59 @@
+"""Figures of motions contain what they say."""
+import numpy as np
+import pytest
+from motion_scenes import TIMES, make_truth, observe
+from numpy.testing import assert_allclose
+
+from photutils_mgauss import ProperMotionFitter
+
+pytest.importorskip('matplotlib')
+
+
+@pytest.fixture
+def axes():
+    from matplotlib.figure import Figure
+    return Figure().add_subplot()
+
+
+@pytest.fixture(scope='module')
+def solutions():
+    rng = np.random.default_rng(3)
+    truth = make_truth(rng, n_stars=80, n_qso=40, ra=0.0)
+    epochs = observe(truth, rng, times=TIMES[[0, 3, 6]], missing=0)
+    return [ProperMotionFitter(references='qso').fit(some)
+            for some in (epochs[::2], epochs)]
+
+
+def test_every_detection_of_an_epoch_has_an_arrow(axes, solutions):
+    solution = solutions[1]
+    solution.plot_residuals(axes, 1)
+    arrows = [collection for collection in axes.collections]
+    assert sum(len(one.get_offsets()) for one in arrows) == 120
+    rows = solution.residuals[solution.residuals['epoch'] == 1]
+    assert_allclose(np.sort(np.concatenate([one.U for one in arrows])),
+                    np.sort(rows['dra'].value))
+    # Around right ascension 0 the field is not torn apart.
+    assert np.ptp(arrows[0].get_offsets()[:, 0]) < 700
+
+
+def test_the_diagram_shows_stars_and_references(axes, solutions):
+    solutions[1].plot_motions(axes)
+    shown = [len(line.get_xdata()) for line in axes.lines[:2]]
+    assert sorted(shown) == [40, 80]
+    assert axes.xaxis_inverted()
+
+
+def test_errors_against_magnitude_and_epochs_are_those_of_the_table(
+        axes, solutions):
+    from photutils_mgauss.plotting import (
+        plot_errors_by_epochs,
+        plot_motion_errors,
+    )
+    plot_motion_errors(axes, solutions[1].stars, np.arange(120))
+    assert_allclose(axes.lines[0].get_ydata(),
+                    solutions[1].stars['pmra_error'].value)
+    plot_errors_by_epochs(axes, solutions)
+    line = axes.lines[2]
+    assert_allclose(line.get_xdata(), [2, 3])
+    assert_allclose(line.get_ydata(), [np.median(
+        one.stars['pmra_error'].value) for one in solutions])
