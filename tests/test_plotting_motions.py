@@ -27,7 +27,7 @@ def solutions():
 def test_every_detection_of_an_epoch_has_an_arrow(axes, solutions):
     solution = solutions[1]
     solution.plot_residuals(axes, 1)
-    arrows = [collection for collection in axes.collections]
+    arrows = list(axes.collections)
     assert sum(len(one.get_offsets()) for one in arrows) == 120
     rows = solution.residuals[solution.residuals['epoch'] == 1]
     assert_allclose(np.sort(np.concatenate([one.U for one in arrows])),

@@ -696,6 +696,7 @@ def test_resampled_medians_scatter_like_medians(rng):
     values = rng.normal(size=1000)
     draws = bootstrap_median(values, n_resamples=4000, rng=3)
     assert_allclose(draws.std(), np.sqrt(np.pi / 2 / 1000), rtol=0.15)
+    assert_allclose(draws.mean(), np.median(values), atol=0.01)
     again = bootstrap_median(values, n_resamples=4000, rng=3)
     assert_allclose(again, draws)
     with pytest.raises(ValueError, match='at least 2'):
