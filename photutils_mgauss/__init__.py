@@ -52,6 +52,11 @@ _OWNERS = {
     'Shapes': 'shapes',
     'ShapeStatus': 'shapes',
     'fit_mixture': 'fitting',
+    'CramerRao': 'noise',
+    'cramer_rao': 'noise',
+    'pixel_error': 'noise',
+    'add_sky_positions': 'sky_photometry',
+    'fit_many': 'sky_photometry',
     'MixtureFitter': 'fitter',
     'MixturePSFPhotometry': 'photometry',
 }
