@@ -57,6 +57,8 @@ _OWNERS = {
     'pixel_error': 'noise',
     'add_sky_positions': 'sky_photometry',
     'fit_many': 'sky_photometry',
+    'PixelPhaseError': 'pixel_phase',
+    'pixel_phase_error': 'pixel_phase',
     'MixtureFitter': 'fitter',
     'MixturePSFPhotometry': 'photometry',
 }
