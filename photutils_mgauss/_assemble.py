@@ -109,14 +109,15 @@ def assemble(epochs, references, match):
     """
     vectors = [sky_vectors(epoch) if epoch.is_sky else None
                for epoch in epochs]
-    seen = [vector for vector in vectors if vector is not None]
-    plane = _common_plane(seen)
+    plane = _common_plane(vectors)
     unit = _common_unit(epochs, references, plane)
-    detections = [read_epoch(epoch, plane, vector) for epoch, vector in zip(
-        epochs, vectors, strict=True)]
+    # Popped, so that a million directions are kept no longer than needed.
+    detections = [read_epoch(epoch, plane, vectors.pop(0))
+                  for epoch in epochs]
+    on_sky = all(epoch.is_sky for epoch in epochs)
     catalogue = (read_catalogue(references, plane, unit)
                  if is_table(references) else None)
-    by_id = _matches_by_id(detections, catalogue, match, unit)
+    by_id = _matches_by_id(detections, on_sky, match, unit)
     if by_id:
         matches, names = match_ids([one.ids for one in detections])
     else:
@@ -128,15 +129,16 @@ def assemble(epochs, references, match):
 
 
 def _common_plane(vectors):
-    if not vectors:
+    """Return the plane at the mean direction, None if there is no sky."""
+    seen = [vector for vector in vectors if vector is not None]
+    if not seen:
         return None
-    everything = np.concatenate(vectors, axis=1)
-    if not np.isfinite(everything).all(axis=0).any():
+    total = sum(np.nansum(vector, axis=1) for vector in seen)
+    if not total.any():
         msg = ('epochs must have finite positions, got none inside the '
-               'bounding box of its WCS')
+               'bounding boxes of their WCS')
         raise ValueError(msg)
-    good = np.isfinite(everything).all(axis=0)
-    return TangentPlane.around(everything[:, good])
+    return TangentPlane.around(total)
 
 
 def _common_unit(epochs, references, plane):
@@ -155,10 +157,9 @@ def _common_unit(epochs, references, plane):
     return units.pop()
 
 
-def _matches_by_id(detections, catalogue, match, unit):
+def _matches_by_id(detections, on_sky, match, unit):
     """Return whether to match by identifier."""
     have = all(one.ids is not None for one in detections)
-    on_sky = all(one.vectors is not None for one in detections)
     if match.by == 'id' and not have:
         msg = "epochs must all have a column 'id' to be matched by it"
         raise ValueError(msg)
@@ -174,11 +175,10 @@ def _matches_by_id(detections, catalogue, match, unit):
                    'match_radius must be given')
             raise ValueError(msg)
         return have
-    return have and _same_objects(detections, catalogue,
-                                  match.tolerance(unit))
+    return have and _same_objects(detections, match.tolerance(unit))
 
 
-def _same_objects(detections, catalogue, tolerance):
+def _same_objects(detections, tolerance):
     """
     Return whether equal identifiers are equal places in the sky.
 

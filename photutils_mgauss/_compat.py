@@ -12,43 +12,47 @@ from photutils.utils._deprecation import DeprecatedColumnQTable
 from photutils.utils._misc import _get_meta
 
 # Before 3.1, photutils builds one class for all groups of n stars whose model
-# class has the same name, and captures the first model it meets: its state
-# outside Parameters and its ``fixed`` flags serve every later model.
+# has the same class name in ``__class__``, and captures the first model it
+# meets: its state outside Parameters and its ``fixed`` flags serve every
+# later model.
 STALE_GROUP_MODELS = not minversion(photutils, '3.1')
 
 _CLASSES = WeakValueDictionary()
 
 
-def set_identity(model, state):
+def group_class(model):
     """
-    Give the model a class whose name says all that photutils may capture.
+    Return a class whose name says all that photutils may capture.
+
+    It is what a model gives as its ``__class__`` where that is needed. Its
+    ``type`` stays the public class, by which other packages, such as asdf,
+    recognise it.
 
     Parameters
     ----------
     model : `~astropy.modeling.Model`
-        Its class is replaced, in place, by a subclass without any content.
-    state : hashable
-        What is not in Parameter values. The ``fixed`` flags are added.
+        Its ``_state`` is what is not in Parameters, and hashable.
     """
-    if not STALE_GROUP_MODELS:
-        return
-    public = public_class(model)
+    public = type(model)
+    if '_ready' not in model.__dict__:
+        return public
     flags = ''.join('01'[getattr(model, name).fixed]
                     for name in model.param_names)
-    key = (public, state, flags)
+    key = (public, model._state, flags)
     cls = _CLASSES.get(key)
     if cls is None:
-        name = f'{public.__name__}_{state}_{int("1" + flags, 2):x}'
-        members = {'__init__': public.__init__, '__call__': public.__call__,
-                   '__module__': public.__module__, '_public_class': public,
-                   '__doc__': public.__doc__}
-        cls = _CLASSES[key] = type(public)(name, (public,), members)
-    model.__class__ = cls
+        cls = _CLASSES[key] = _named_subclass(public, model._state, flags)
+    # Alive as long as the model, or each look would build another one.
+    model.__dict__['_group_class'] = cls
+    return cls
 
 
-def public_class(model):
-    """Return the class of a model as its users know it."""
-    return getattr(type(model), '_public_class', type(model))
+def _named_subclass(public, state, flags):
+    name = f'{public.__name__}_{state}_{int("1" + flags, 2):x}'
+    members = {'__init__': public.__init__, '__call__': public.__call__,
+               '__module__': public.__module__, '__doc__': public.__doc__}
+    return type(public)(name, (public,), members)
+
 
 # Since 3.1 a star fitted outside its own pixels has a flag of its own, and
 # the flag for bounds looks at all of a model's bounds.

@@ -16,10 +16,11 @@ from photutils.background import Background2D
 from photutils.detection import DAOStarFinder
 from scipy.spatial import cKDTree
 
-from photutils_mgauss.field import fit_mixture_field, select_psf_stars
+from photutils_mgauss.field import fit_mixture_field
 from photutils_mgauss.gridded import GriddedMixturePSF
 from photutils_mgauss.photometry import MixturePSFPhotometry
 from photutils_mgauss.proper_motion import Epoch, ProperMotionFitter
+from photutils_mgauss.selection import select_psf_stars
 from photutils_mgauss.simulation import (
     Instrument,
     paper_exposures,
@@ -153,12 +154,13 @@ def _without_ids(catalogue):
 
 def _match(stars, sources):
     """Return measured stars, not quasars, beside their true motions."""
+    stars = stars[np.isfinite(stars['pmra'].value)
+                  & (stars['n_good_obs'] > 1)]
     found = SkyCoord(stars['ra'], stars['dec'])
     true = SkyCoord(sources['ra'], sources['dec'])
     index, distance, _ = found.match_to_catalog_sky(true)
     nearest = sources[index]
-    good = ((distance < 0.1 * u.arcsec) & (nearest['kind'] == 'star')
-            & np.isfinite(stars['pmra'].value) & (stars['n_good_obs'] > 1))
+    good = (distance < 0.1 * u.arcsec) & (nearest['kind'] == 'star')
     table = stars[good]['pmra', 'pmdec', 'pmra_error', 'pmdec_error',
                         'n_good_obs']
     for name in ('pmra', 'pmdec'):

@@ -53,6 +53,11 @@ class DetectorEffects:
     charge_diffusion : float, optional
         Standard deviation of the spread of charge in the detector [pix],
         which widens the PSF.
+    brighter_fatter : float, optional
+        The strength of the repulsion of charge, 1 for a common CCD. It needs
+        galsim and a PSF of mixtures that are integrated over pixels, and
+        draws every photon; only stars with their centre on the image are
+        drawn.
 
     Raises
     ------
@@ -77,18 +82,22 @@ class DetectorEffects:
     nonlinearity: float = 0.0
     bleeding: bool = False
     charge_diffusion: float = 0.0
+    brighter_fatter: float = 0.0
 
     def __post_init__(self):
         for name in ('prnu', 'hot_pixels', 'dead_pixels', 'nonlinearity'):
             as_real(getattr(self, name), name, minimum=0, maximum=1)
-        for name in ('hot_dark', 'cosmic_rays', 'charge_diffusion'):
+        for name in ('hot_dark', 'cosmic_rays', 'charge_diffusion',
+                     'brighter_fatter'):
             as_real(getattr(self, name), name, minimum=0)
         as_integer(self.bad_columns, 'bad_columns', minimum=0)
 
     @classmethod
     def typical(cls):
         """
-        Return all effects, of a size common for CCDs in space.
+        Return the effects of a size common for CCDs in space.
+
+        The brighter-fatter effect is left out, which needs galsim and time.
 
         Returns
         -------
@@ -97,12 +106,6 @@ class DetectorEffects:
         return cls(prnu=0.01, hot_pixels=2e-5, dead_pixels=1e-5,
                    bad_columns=1, cosmic_rays=1.5, nonlinearity=0.005,
                    bleeding=True, charge_diffusion=0.2)
-
-    def widen(self, psf):
-        """Return the PSF with the diffusion of charge in it."""
-        if self.charge_diffusion == 0:
-            return psf
-        return psf.convolve(self.charge_diffusion**2 * np.eye(2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -209,14 +209,12 @@ class Detections:
     """
     What an epoch says about each of its n rows, as plain arrays.
 
-    ``vectors`` (3, n) are ICRS directions, or None for a plane without sky.
     ``plane`` (2, n) and ``covariance`` (3, n: xx, xy, yy) are in the frame's
     unit, mas or pixels. ``found`` says which positions are finite,
     ``usable`` which errors are good as well.
     """
 
     ids: np.ndarray | None
-    vectors: np.ndarray | None
     plane: np.ndarray
     covariance: np.ndarray
     years: np.ndarray
@@ -259,6 +257,13 @@ def plane_unit(epoch):
     return 'pix'
 
 
+def pixel_size(epoch):
+    """Return plane units in a pixel of an epoch without sky, or None."""
+    if epoch.pixel_scale is not None:
+        return _angle_per_pixel(epoch.pixel_scale)
+    return 1.0 if plane_unit(epoch) == 'pix' else None
+
+
 def sky_vectors(epoch):
     """Return ICRS unit vectors (3, n) of an epoch with sky positions."""
     if epoch.is_pixels:
@@ -295,8 +300,8 @@ def read_epoch(epoch, plane=None, vectors=None):
     found &= np.isfinite(years)
     positions = np.where(found, positions, np.nan)
     usable = found & _positive_definite(covariance)
-    return Detections(_ids(epoch.table), vectors, positions, covariance,
-                      years, _flux(epoch.table), found, usable)
+    return Detections(_ids(epoch.table), positions, covariance, years,
+                      _flux(epoch.table), found, usable)
 
 
 def _read_plane(epoch):

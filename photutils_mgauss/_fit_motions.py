@@ -22,7 +22,6 @@ from photutils_mgauss.alignment import (
     Frames,
     Gauge,
     floor_variance,
-    judge,
     solve_frames,
     worst_outliers,
 )
@@ -148,6 +147,10 @@ def _scattered(scene):
 
 
 def _check_parallax(options, observer):
+    if options.parallax and options.recipe == 'paper':
+        msg = ("parallax must be False for the recipe 'paper', got "
+               f'{options.parallax!r}')
+        raise ValueError(msg)
     if options.parallax and observer is None:
         msg = ('parallax must be False for epochs without a place in the '
                f'sky, got {options.parallax!r}')
@@ -278,7 +281,9 @@ def build_problem(scene, state):
         stars, drift = scene.drift
         offsets[..., stars] -= drift
     offsets = np.nan_to_num(offsets)
-    weights = np.where(state.used, invert_2x2(*measured(scene, state)), 0.0)
+    weights = np.stack([
+        np.where(state.used[e], invert_2x2(*measured(scene, state, e)), 0.0)
+        for e in range(len(state.maps))], axis=1)
     priors = scene.priors.without(state.dropped)
     return Problem(
         offsets, weights, scene.origin, scene.dt,
@@ -287,11 +292,11 @@ def build_problem(scene, state):
         _ties(scene, state))
 
 
-def measured(scene, state):
-    """Return the covariances (3, E, n) of detections with the floors."""
-    floor = state.floor[:, None]
-    xx, xy, yy = scene.sightings.covariance
-    return np.stack([xx + floor, xy, yy + floor])
+def measured(scene, state, e):
+    """Return the covariances (3, n) of an epoch with its floor."""
+    floor = np.broadcast_to(state.floor.T, (2, len(state.maps)))[:, e]
+    xx, xy, yy = scene.sightings.covariance[:, e]
+    return np.stack([xx + floor[0], xy, yy + floor[1]])
 
 
 def _ties(scene, state):
@@ -349,17 +354,6 @@ def align(scene, state):
             raise ValueError(msg)
         before = size
     return problem, frames, state
-
-
-def judged(scene, state, problem, frames, stars=None):
-    """Return estimates with residuals, and their `Judgement`."""
-    covariance = measured(scene, state)
-    if stars is not None:
-        problem, covariance = problem.select(stars), covariance[..., stars]
-    estimates = solve_all(problem, frames.correction, frames.factor,
-                          scene.options.executor, residuals=True,
-                          leverage=True)
-    return estimates, judge(estimates, covariance, problem.weights)
 
 
 def fit(scene, state):
@@ -434,12 +428,13 @@ def _review(scene, state, problem, frames, fits_floor):
             # Residuals are judged once the floors are right: a floor that
             # is too small would make outliers of all bright stars.
             return replace(state, floor=floor), True
-    estimates, judgement = judged(scene, state, problem, frames)
+    estimates = solve_all(problem, frames.correction, frames.factor,
+                          scene.options.executor, judge=True)
     dropped = _discrepant(scene, state, problem, frames, estimates)
     if len(dropped):
         return replace(state, dropped=np.union1d(state.dropped,
                                                  dropped)), True
-    bad = worst_outliers(judgement, state.used, _spare(problem, state),
+    bad = worst_outliers(estimates.chi2, state.used, _spare(problem, state),
                          scene.options.clip)
     if bad.any():
         return replace(state, used=state.used & ~bad), True
@@ -452,7 +447,7 @@ def _inconsistent(scene, problem, estimates):
     """Return stars (n,) that no more rejections can make agree."""
     dof = 2 * (problem.weights[0] > 0).sum(axis=0) - problem.n_parameters
     tail = 2 * stats.norm.sf(scene.options.clip)
-    chi2 = np.nan_to_num(data_chi2(estimates, problem), nan=0.0)
+    chi2 = np.nansum(estimates.raw, axis=0)
     out = (dof > 0) & (chi2 > stats.chi2.isf(tail, np.maximum(dof, 1)))
     # References agree with their catalogue, or are none any more.
     out[problem.priors.stars] &= ~scene.anchors[problem.priors.stars] | (
@@ -514,12 +509,14 @@ def _floors(scene, state, problem, frames, estimate):
     stars = np.flatnonzero(problem.ties & scene.anchors
                            & ~np.isin(np.arange(problem.n_stars),
                                       state.dropped))
-    estimates, judgement = judged(scene, state, problem, frames, stars)
+    estimates = solve_all(problem.select(stars), frames.correction,
+                          frames.factor, scene.options.executor,
+                          residuals=True, judge=True)
     covariance = scene.sightings.covariance[..., stars]
     used = state.used[:, stars]
     return np.array([estimate(
         np.where(used[e], estimates.residuals[:, e], np.nan),
-        covariance[:, e], judgement.expected[e], state.floor[e])
+        covariance[:, e], estimates.expected[e], state.floor[e])
         for e in range(len(state.floor))])
 
 

@@ -32,7 +32,7 @@ once the maps have converged, and only with a common basis are shifts of all
 frames together exactly undetermined, as they must be.
 """
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -42,6 +42,7 @@ from photutils_mgauss._stacked import (
     apply_transposed,
     gram,
     inverse_factor,
+    invert_2x2,
 )
 
 CHUNK = 8192  # stars worked on at a time: what fits into a processor's cache
@@ -369,6 +370,7 @@ class Task:
     factor: np.ndarray      # (M, q), covariance of r is factor @ factor.T
     residuals: bool = False
     leverage: bool = False
+    judge: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,28 +381,67 @@ class Estimates:
     ``values`` (p, n) and ``covariance`` (p, p, n); NaN where not solved.
     ``residuals`` (2, E, n) is measured minus fitted, ``predicted`` (3, E, n)
     the part of its covariance that the fit took away.
+
+    Each detection is judged by how far it lies from the fit: ``chi2``
+    (E, n) has two degrees of freedom and takes into account that a
+    detection pulls the fit towards itself, NaN where nothing can be said;
+    ``raw`` (E, n) is the plain chi-square, and ``expected`` (E, n) what to
+    expect of that, 2 minus the leverage.
     """
 
     values: np.ndarray
     covariance: np.ndarray
     residuals: np.ndarray | None = None
     predicted: np.ndarray | None = None
+    chi2: np.ndarray | None = None
+    raw: np.ndarray | None = None
+    expected: np.ndarray | None = None
 
 
 def solve_stars(task):
     """Return the `Estimates` of a part of the stars."""
     stars = eliminate(task.problem)
-    scaled = _scaled_rows(stars, task.factor)
+    scaled = scaled_rows(stars, task.factor)
     shift = _shift(stars.basis, task.correction)
     values, covariance = _estimate(stars, shift, scaled)
     residuals = predicted = None
-    if task.residuals:
-        residuals = task.problem.offsets + shift - np.stack([
-            sum(_times(column[c], value) for column, value in zip(
-                stars.columns, values, strict=True)) for c in range(2)])
-    if task.leverage:
+    judged = None, None, None
+    if task.residuals or task.judge:
+        residuals = _residuals(task.problem.offsets + shift, stars, values)
+    if task.leverage or task.judge:
         predicted = _predicted(stars, task, scaled)
-    return Estimates(values, covariance, residuals, predicted)
+    if task.judge:
+        judged = _judge(residuals, predicted, task.problem.weights)
+    return Estimates(values, covariance,
+                     residuals if task.residuals else None,
+                     predicted if task.leverage else None, *judged)
+
+
+def _residuals(offsets, stars, values):
+    return offsets - np.stack([
+        sum(_times(column[c], value) for column, value in zip(
+            stars.columns, values, strict=True)) for c in range(2)])
+
+
+def _judge(residuals, predicted, weights):
+    """Return chi2, raw and expected of `Estimates`, each (E, n)."""
+    x, y = residuals
+    xx, xy, yy = weights
+    used = (xx > 0) & np.isfinite(x)
+    raw = xx * x * x + 2 * xy * x * y + yy * y * y
+    leverage = (xx * predicted[0] + 2 * xy * predicted[1]
+                + yy * predicted[2])
+    covariance = invert_2x2(xx, xy, yy)
+    with np.errstate(invalid='ignore'):
+        left = covariance - predicted
+        whole = covariance[0] * covariance[2] - covariance[1]**2
+        # A detection that alone fixes its star has no residual to judge.
+        sound = used & (left[0] > 0) & (
+            left[0] * left[2] - left[1]**2 > 1e-4 * whole)
+        a, b, c = invert_2x2(*left)
+        chi2 = a * x * x + 2 * b * x * y + c * y * y
+    return tuple(np.where(good, values, np.nan) for good, values in (
+        (sound, chi2), (used, raw), (used, 2 - leverage)))
 
 
 def _times(column, value):
@@ -424,7 +465,7 @@ def _shift(basis, correction):
     return np.swapaxes(correction @ basis, 0, 1)
 
 
-def _scaled_rows(stars, factor):
+def scaled_rows(stars, factor):
     """Return Z C for S^-1 = C C^T, shape (p, n, q)."""
     return np.stack([stars.rows(k).T @ factor
                      for k in range(len(stars.factor))])
@@ -464,13 +505,13 @@ def _project(stars, e, c):
 
 
 def solve_all(problem, correction, factor, executor=None, *,
-              residuals=False, leverage=False):
+              residuals=False, leverage=False, judge=False):
     """Return the `Estimates` of all stars of a problem."""
     results = run(executor, solve_stars, (
-        Task(part, correction, factor, residuals, leverage)
+        Task(part, correction, factor, residuals, leverage, judge)
         for part in parts(problem)))
-    return Estimates(*(_join(results, name) for name in (
-        'values', 'covariance', 'residuals', 'predicted')))
+    return Estimates(*(_join(results, field.name)
+                       for field in fields(Estimates)))
 
 
 def _join(results, name):
@@ -491,7 +532,7 @@ def cross_covariance(problem, factor):
     out = np.zeros((n, p, n, p))
     if factor.size:
         scaled = np.einsum('kin,knq->niq', stars.factor,
-                           _scaled_rows(stars, factor))
+                           scaled_rows(stars, factor))
         flat = scaled.reshape(n * p, -1)
         out += (flat @ flat.T).reshape(out.shape)
     out[np.arange(n), :, np.arange(n)] += np.moveaxis(

@@ -10,11 +10,17 @@ from photutils_mgauss._fit_motions import (
     measured,
     prior_rank,
 )
-from photutils_mgauss._joint import parallax_leak, parts, run, solve_all
+from photutils_mgauss._joint import (
+    cross_covariance,
+    parallax_leak,
+    parts,
+    run,
+    solve_all,
+)
 from photutils_mgauss._parallax import tdb
+from photutils_mgauss._references import FIXED
 from photutils_mgauss._stacked import invert_2x2
 from photutils_mgauss._tangent_plane import directions
-from photutils_mgauss.alignment import judge
 
 # What each bit of a star's flags means.
 FLAGS = {
@@ -67,18 +73,22 @@ def at_epoch(fit, year):
 
     Positions are plane coordinates, no longer relative to an origin.
     """
+    move = _shift_in_time(fit, year)
+    values = move @ fit.estimates.values
+    values[:2] += fit.scene.origin
+    half = np.tensordot(move, fit.estimates.covariance, axes=1)
+    return values, np.einsum('ijn,kj->ikn', half, move)
+
+
+def _shift_in_time(fit, year):
+    """Return the matrix from parameters at the working epoch to a year."""
     dt = year - fit.scene.working_year
-    values, covariance = fit.estimates.values, fit.estimates.covariance
-    size = len(values)
-    move = np.eye(size)
+    move = np.eye(fit.problem.n_parameters)
     move[0, 2] = move[1, 3] = dt
     if fit.scene.options.acceleration:
         move[0, -2] = move[1, -1] = dt**2 / 2
         move[2, -2] = move[3, -1] = dt
-    values = move @ values
-    values[:2] += fit.scene.origin
-    covariance = np.einsum('ij,jkn,lk->iln', move, covariance, move)
-    return values, covariance
+    return move
 
 
 def _inverse_2x2(matrix):
@@ -92,17 +102,81 @@ def turned(plane, values, covariance):
 
     The position stays in plane coordinates, its covariance turns.
     """
-    size = len(values)
-    inverse = _inverse_2x2(plane.local_jacobian(values[:2]))
-    turn = np.zeros((size, size, values.shape[1]))
-    turn[np.arange(size), np.arange(size)] = 1.0
-    pairs = [0, 2] + ([size - 2] if size > 5 else [])
-    for k in pairs:
-        turn[k:k + 2, k:k + 2] = inverse
+    turn = _turns(plane, values[:2], len(values))
     moved = np.einsum('ijn,jn->in', turn, values)
     moved[:2] = values[:2]
     half = np.einsum('ijn,jkn->ikn', turn, covariance)
     return moved, np.einsum('ijn,kjn->ikn', half, turn)
+
+
+def _turns(plane, places, size):
+    """Return the matrices (p, p, n) from the plane's axes to local ones."""
+    inverse = _inverse_2x2(plane.local_jacobian(places))
+    turn = np.zeros((size, size, places.shape[1]))
+    turn[np.arange(size), np.arange(size)] = 1.0
+    for k in [0, 2] + [size - 2] * (size > 5):
+        turn[k:k + 2, k:k + 2] = inverse
+    return turn
+
+
+def star_covariance(fit, stars, ref_year):
+    """Return covariances (k, p, k, p) in Gaia's order, at an epoch."""
+    problem = fit.problem.select(stars)
+    covariance = cross_covariance(problem, fit.frames.factor)
+    size = problem.n_parameters
+    change = np.repeat(_shift_in_time(fit, ref_year)[None], len(stars), 0)
+    plane = fit.scene.sightings.plane
+    if plane is not None:
+        places = at_epoch(fit, ref_year)[0][:2, stars]
+        change = _turns(plane, places, size).transpose(2, 0, 1) @ change
+    covariance = np.einsum('kij,kjlm,lnm->kiln', change, covariance, change)
+    order = [k for k in FROM_OURS if k < size] if (
+        fit.scene.options.parallax) else [0, 1, 2, 3]
+    return covariance[:, order][:, :, :, order]
+
+
+def validation_table(fit, stars):
+    """Return held-out references beside their catalogue values."""
+    sightings, held = fit.scene.sightings, fit.scene.held
+    unit = u.Unit(sightings.unit) / u.yr
+    motion, covariance = _catalogue_motions(sightings, held)
+    rows = stars[held]
+    table = QTable({'id': rows['id']})
+    away, errors = [], []
+    for k, name in enumerate(('pmra', 'pmdec')):
+        away.append(rows[name].to_value(unit) - motion[k])
+        errors.append(np.sqrt(rows[f'{name}_error'].to_value(unit)**2
+                              + covariance[k, k]))
+        table[f'd{name}'] = away[k] * unit
+        table[f'd{name}_error'] = errors[k] * unit
+    cross = covariance[0, 1] + (rows['pmra_pmdec_corr']
+                                * rows['pmra_error'].to_value(unit)
+                                * rows['pmdec_error'].to_value(unit))
+    a, b, c = invert_2x2(errors[0]**2, cross, errors[1]**2)
+    x, y = away
+    table['chi2'] = a * x * x + 2 * b * x * y + c * y * y
+    return table
+
+
+def _catalogue_motions(sightings, stars):
+    """Return catalogue motions (2, k) and covariances in local axes."""
+    motion = np.zeros((2, len(stars)))
+    covariance = np.zeros((2, 2, len(stars)))
+    if sightings.catalogue is None:
+        return motion, covariance
+    place = {star: k for k, star in enumerate(sightings.references)}
+    which = [place[star] for star in stars]
+    catalogue = sightings.catalogue
+    motion = catalogue.motion()[:, which]
+    moves = ~np.isin(catalogue.kinds[which], FIXED)
+    covariance = catalogue.covariance[2:4, 2:4][..., which] * moves
+    if sightings.plane is not None:
+        turn = _inverse_2x2(sightings.plane.local_jacobian(
+            catalogue.values[:2, which]))
+        turn = np.where(np.isfinite(turn), turn, np.eye(2)[..., None])
+        motion = np.einsum('ijn,jn->in', turn, motion)
+        covariance = np.einsum('ijn,jkn,lkn->iln', turn, covariance, turn)
+    return motion, covariance
 
 
 def star_table(fit, ref_year):
@@ -132,14 +206,14 @@ def _add_parameters(table, fit, values, covariance):
     has_parallax = bool(fit.scene.options.parallax)
     values, covariance, extra = _gaia_order(values, covariance, has_parallax,
                                             fit.scene.options.acceleration)
-    sigma = np.sqrt(np.stack([covariance[k, k] for k in range(5)]))
+    sigma = [np.sqrt(covariance[k][k]) for k in range(5)]
     units = (unit, unit, unit, unit / u.yr, unit / u.yr)
     plane = fit.scene.sightings.plane
     if plane is not None:
-        ra, dec = directions(plane.deproject(values[:2]))
+        ra, dec = directions(plane.deproject(np.stack(values[:2])))
         table['ra'], table['dec'] = ra * u.deg, dec * u.deg
     else:
-        table['x'], table['y'] = values[:2] * unit
+        table['x'], table['y'] = (value * unit for value in values[:2])
     for k, name in enumerate(GAIA):
         if k > 1:
             table[name] = values[k] * units[k]
@@ -147,7 +221,7 @@ def _add_parameters(table, fit, values, covariance):
     for i in range(5):
         for j in range(i + 1, 5):
             with np.errstate(invalid='ignore'):
-                rho = covariance[i, j] / (sigma[i] * sigma[j])
+                rho = covariance[i][j] / (sigma[i] * sigma[j])
             table[f'{GAIA[i]}_{GAIA[j]}_corr'] = rho
     for k, name in enumerate(('accra', 'accdec')):
         if extra is not None:
@@ -163,11 +237,11 @@ def _gaia_order(values, covariance, has_parallax, acceleration):
         extra = values[-2:], np.sqrt(np.stack([covariance[-2, -2],
                                                covariance[-1, -1]]))
     size = 5 if has_parallax else 4
-    full = np.full((5, n), np.nan)
-    full[:size] = values[:size]
-    matrix = np.full((5, 5, n), np.nan)
-    matrix[:size, :size] = covariance[:size, :size]
-    return full[FROM_OURS], matrix[FROM_OURS][:, FROM_OURS], extra
+    nothing = np.full(n, np.nan)
+    full = [values[k] if k < size else nothing for k in FROM_OURS]
+    matrix = [[covariance[j, k] if max(j, k) < size else nothing
+               for k in FROM_OURS] for j in FROM_OURS]
+    return full, matrix, extra
 
 
 def _flags(fit):
@@ -252,7 +326,7 @@ def _reference_kinds(fit):
     return out
 
 
-def alignment_table(fit):
+def alignment_table(fit, wcs_residuals):
     """Return the `~astropy.table.QTable` of the epochs' maps."""
     scene, state = fit.scene, fit.state
     sightings, transform = scene.sightings, scene.transform
@@ -273,7 +347,9 @@ def alignment_table(fit):
     table['matrix'] = np.array(slope)
     table['coefficients'] = state.maps * unit
     _add_counts(table, fit, unit)
-    table['systematic'] = np.sqrt(state.floor) * unit
+    floor = np.broadcast_to(state.floor.T, (2, len(state.maps))).T
+    table['systematic'] = np.sqrt(floor) * unit
+    table['wcs_residual'] = np.array(wcs_residuals) * u.mas
     table.meta.update(kind=transform.kind, degree=transform.degree,
                       xcentre=transform.centre[0],
                       ycentre=transform.centre[1], scale=transform.scale)
@@ -323,9 +399,10 @@ def residual_table(fit):
     epoch, star = np.nonzero(sightings.matches.seen)
     at = (epoch, star)
     full = solve_all(fit.problem, fit.frames.correction, fit.frames.factor,
-                     scene.options.executor, residuals=True, leverage=True)
-    covariance = measured(scene, fit.state)
-    judgement = judge(full, covariance, fit.problem.weights)
+                     scene.options.executor, residuals=True, leverage=True,
+                     judge=True)
+    covariance = np.stack([measured(scene, fit.state, e)
+                           for e in range(len(fit.state.maps))], axis=1)
     unit = u.Unit(sightings.unit)
     finite = np.isfinite(sightings.places).all(axis=0)
     table = QTable({'epoch': epoch, 'id': sightings.names[star],
@@ -334,12 +411,12 @@ def residual_table(fit):
     table['time'] = years * u.yr
     _add_aligned(table, fit, at, finite, unit)
     residual = np.where(finite, full.residuals, np.nan)
-    left_out = _leave_one_out(full, covariance, judgement)
+    left_out = _leave_one_out(full, covariance)
     for k, name in enumerate(('dra', 'ddec')):
         table[name] = residual[k][at] * unit
         table[f'{name}_error'] = np.sqrt(covariance[2 * k][at]) * unit
         table[f'{name}_left_out'] = left_out[k][at] * unit
-    table['chi2'] = judgement.chi2[at]
+    table['chi2'] = full.chi2[at]
     table['used'] = fit.state.used[at]
     return table
 
@@ -355,11 +432,13 @@ def _add_aligned(table, fit, at, finite, unit):
         table['x'], table['y'] = (axis[at] * unit for axis in aligned)
 
 
-def _leave_one_out(estimates, covariance, judgement):
+def _leave_one_out(estimates, covariance):
     """Return residuals (2, E, n) from fits without the detection itself."""
     x, y = estimates.residuals
     left = invert_2x2(*(covariance - estimates.predicted))
-    a, b = left[0] * x + left[1] * y, left[1] * x + left[2] * y
     xx, xy, yy = covariance
-    out = np.stack([xx * a + xy * b, xy * a + yy * b])
-    return np.where(np.isfinite(judgement.chi2), out, np.nan)
+    # Infinite where a detection alone fixes its star: left out below.
+    with np.errstate(invalid='ignore'):
+        a, b = left[0] * x + left[1] * y, left[1] * x + left[2] * y
+        out = np.stack([xx * a + xy * b, xy * a + yy * b])
+    return np.where(np.isfinite(estimates.chi2), out, np.nan)

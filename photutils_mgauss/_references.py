@@ -18,6 +18,7 @@ from photutils_mgauss._stacked import apply
 from photutils_mgauss._tangent_plane import unit_vectors
 
 CLASSES = ('qso', 'galaxy', 'star', 'position')
+FIXED = ('qso', 'galaxy')  # neither move nor have a parallax
 GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
 UNKNOWN = 1e30  # variance of what is not known
 ORDER = [0, 1, 3, 4, 2]  # Gaia's order to ours: position, motion, parallax
@@ -53,7 +54,7 @@ class Catalogue:
 
 
 def _fixed(kinds):
-    return np.isin(kinds, ('qso', 'galaxy'))
+    return np.isin(kinds, FIXED)
 
 
 def read_catalogue(table, plane, unit):

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from photutils_mgauss._joint import _scaled_rows, eliminate, parts, run
+from photutils_mgauss._joint import eliminate, parts, run, scaled_rows
 from photutils_mgauss._stacked import gram
 
 
@@ -79,7 +79,7 @@ def _pieces(problem, frames, family, weights, estimates, **others):
 def _frame_part(stars, factor):
     """Return R^T Z C of all stars, shape (p, n, q)."""
     return np.einsum('kin,knq->inq', stars.factor,
-                     _scaled_rows(stars, factor))
+                     scaled_rows(stars, factor))
 
 
 def _accumulate(piece):

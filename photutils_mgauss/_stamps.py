@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from photutils_mgauss import _kernels
+from photutils_mgauss._phases import phase_rows
 from photutils_mgauss.mixture import GaussianMixture
 
 _TOLERANCE = 1e-8
@@ -21,6 +22,10 @@ _MIN_STDDEV = 0.4
 # power of the image.
 _TIE = 1e6
 _STIFFNESS = 1.0
+# What a centroid error of one native pixel costs, in the same unit, and how
+# often the map to centroid errors follows the solution.
+_ASTROMETRY = 100.0
+_ASTROMETRY_ROUNDS = 2
 # The steps every split gets, and how many of the best go on.
 _TRIAL_STEPS = 8
 _FINALISTS = 2
@@ -37,6 +42,7 @@ class Problem(NamedTuple):
     tied: bool
     signed: bool
     fixed: bool
+    astrometric: bool
     has_error: bool
 
     @property
@@ -67,8 +73,8 @@ class Workspace:
         self.scratch = (
             np.empty((k, *shape)), np.empty(shape), np.empty((k, k)),
             np.empty(k), np.empty((k, k + 1)), np.empty(k, bool),
-            np.empty((k, 6, 6)), np.empty((5, 5)), np.empty(6),
-            np.empty((6, 6)))
+            np.empty((k, 6, 6)), np.empty((5, shape[1])), np.empty((5, 5)),
+            np.empty((6, 6)), np.empty((6, 6)))
         self.matrices = np.empty((n, n)), np.empty((n, n))
         self.vectors = (np.empty(n), np.empty(n), np.empty((k, 5)),
                         np.empty(k))
@@ -80,7 +86,7 @@ class Stamp(NamedTuple):
 
     ``pixels`` have a peak of 1 and ``weight`` makes their power 1: pixel
     unit ``scale`` and weight unit ``weight_unit``. Means are relative to
-    ``centre``; ``tie`` and ``limits`` are the kernels'.
+    ``centre``; ``tie``, ``rows`` and ``limits`` are the kernels'.
     """
 
     pixels: np.ndarray
@@ -88,6 +94,7 @@ class Stamp(NamedTuple):
     centre: np.ndarray
     peak: np.ndarray
     tie: tuple
+    rows: np.ndarray
     limits: np.ndarray
     scale: float
     weight_unit: float
@@ -105,8 +112,8 @@ class Stamp(NamedTuple):
         reach = _reach(used, centre)
         limits = np.array([np.log(_MIN_STDDEV), np.log(reach.max()), *reach,
                            _STIFFNESS])
-        return cls(pixels, weight / weight_unit, centre, peak, tie, limits,
-                   scale, weight_unit)
+        return cls(pixels, weight / weight_unit, centre, peak, tie,
+                   np.empty((0, *image.shape)), limits, scale, weight_unit)
 
 
 def _reach(used, centre):
@@ -132,7 +139,8 @@ def run(stamp, problem, spaces, shapes, max_steps=_MAX_STEPS):
     space = spaces[len(shapes)]
     cost, status, _ = _kernels.fit_shapes(
         stamp.pixels, stamp.weight, stamp.centre, shapes, fluxes, stamp.tie,
-        problem.signed, problem.fixed, stamp.limits, _TOLERANCE, max_steps,
+        problem.signed, stamp.rows, problem.fixed, stamp.limits, _TOLERANCE,
+        max_steps,
         space.scratch, space.matrices, space.vectors)
     return Solution(shapes, fluxes, cost, status == _kernels.FIT_STOPPED)
 
@@ -156,6 +164,29 @@ def search(stamp, problem, spaces):
                     for trial in trials[:n_best]),
                    key=lambda solution: solution.cost)
     return best
+
+
+def refine_astrometry(stamp, problem, spaces, solution):
+    """Return the solution refitted with centroid errors in its cost."""
+    for _ in range(_ASTROMETRY_ROUNDS):
+        rows = _phase_rows(stamp, problem, solution)
+        solution = run(stamp._replace(rows=rows), problem, spaces,
+                       solution.shapes)
+    return solution
+
+
+def _phase_rows(stamp, problem, solution):
+    """Return centroid errors of the kernels' residual as few rows."""
+    rows = phase_rows(mixture_of(solution, problem, stamp.centre),
+                      solution.fluxes.sum() / problem.pitch.prod(),
+                      stamp.pixels.shape, problem.pitch, problem.origin,
+                      stamp.weight > 0)
+    rows = rows.reshape(-1, stamp.pixels.size)
+    # The rows count by the sum of their squares alone, so rotated ones do.
+    _, size, directions = np.linalg.svd(rows, full_matrices=False)
+    seen = size > 1e-4 * size[0]
+    rows = np.sqrt(_ASTROMETRY) * size[seen, None] * directions[seen]
+    return np.ascontiguousarray(rows).reshape(-1, *stamp.pixels.shape)
 
 
 def _core(stamp, problem):
@@ -256,10 +287,10 @@ def covariance_of(problem, stamp, solution, space):
     matrix, gradient = np.empty((6 * n, 6 * n)), np.empty(6 * n)
     _kernels.project(stamp.pixels, stamp.weight, stamp.centre,
                      solution.shapes, stamp.tie, problem.signed,
-                     solution.fluxes.copy(), space.scratch)
+                     stamp.rows[:0], solution.fluxes.copy(), space.scratch)
     _kernels.normal_equations(
         stamp.weight, stamp.centre, solution.shapes, solution.fluxes,
-        stamp.tie, space.scratch, matrix, gradient)
+        stamp.tie, stamp.rows[:0], space.scratch, matrix, gradient)
     _kernels.add_penalties(solution.shapes, stamp.limits, matrix, gradient)
     # From fluxes first to Gaussian by Gaussian.
     place = np.column_stack([np.arange(n),

@@ -204,43 +204,7 @@ def tie_plane(points, targets, weights, kind):
     return np.column_stack([start, slope])
 
 
-@dataclass(frozen=True, eq=False)
-class Judgement:
-    """
-    How far each detection lies from the fit, in its own expected error.
-
-    ``chi2`` (E, n) has two degrees of freedom and takes into account that a
-    detection pulls the fit towards itself; NaN where nothing can be said.
-    ``expected`` (E, n) is the expected raw chi-square, 2 minus leverage.
-    """
-
-    chi2: np.ndarray
-    raw: np.ndarray
-    expected: np.ndarray
-
-
-def judge(estimates, covariance, weights):
-    """Return the `Judgement` of residuals (2, E, n)."""
-    x, y = estimates.residuals
-    xx, xy, yy = weights
-    used = (xx > 0) & np.isfinite(x)
-    raw = np.where(used, xx * x * x + 2 * xy * x * y + yy * y * y, np.nan)
-    pxx, pxy, pyy = estimates.predicted
-    leverage = xx * pxx + 2 * xy * pxy + yy * pyy
-    left = covariance - estimates.predicted
-    a, b, c = left
-    # A detection that alone fixes a star's place has no residual to judge.
-    with np.errstate(invalid='ignore'):
-        sound = used & (a * c - b * b
-                        > 1e-4 * (covariance[0] * covariance[2]
-                                  - covariance[1]**2)) & (a > 0)
-        ia, ib, ic = invert_2x2(*left)
-        chi2 = ia * x * x + 2 * ib * x * y + ic * y * y
-    return Judgement(np.where(sound, chi2, np.nan), raw,
-                     np.where(used, 2 - leverage, np.nan))
-
-
-def worst_outliers(judgement, used, spare, clip):
+def worst_outliers(chi2, used, spare, clip):
     """
     Return which detections to reject now, (E, n): each star's worst.
 
@@ -249,7 +213,7 @@ def worst_outliers(judgement, used, spare, clip):
     detections enough to tell the bad one.
     """
     limit = stats.chi2.isf(2 * stats.norm.sf(clip), 2)
-    chi2 = np.where(used, np.nan_to_num(judgement.chi2, nan=0.0), 0.0)
+    chi2 = np.where(used, np.nan_to_num(chi2, nan=0.0), 0.0)
     worst = chi2.argmax(axis=0)
     out = np.zeros(used.shape, dtype=bool)
     stars = np.arange(used.shape[1])

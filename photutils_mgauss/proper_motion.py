@@ -9,9 +9,12 @@ from functools import cached_property
 
 import astropy.units as u
 import numpy as np
+from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from photutils_mgauss._assemble import assemble, check_epochs, tie_planes
+from photutils_mgauss._bootstrap import bootstrap_frames, bootstrap_median
+from photutils_mgauss._corrected_wcs import Correction, correct_epoch
 from photutils_mgauss._epoch import Epoch
 from photutils_mgauss._fit_motions import Fit, Options, fit, prepare
 from photutils_mgauss._joint import Priors, solve_all
@@ -19,15 +22,22 @@ from photutils_mgauss._motion_table import (
     FLAGS,
     alignment_table,
     residual_table,
+    star_covariance,
     star_table,
+    validation_table,
 )
-from photutils_mgauss._parallax import julian_years
+from photutils_mgauss._paper_recipe import fit_paper
+from photutils_mgauss._parallax import (
+    julian_years,
+    observer_velocity,
+    tdb,
+)
 from photutils_mgauss._transforms import Transform
-from photutils_mgauss._validation import as_choice, as_real
+from photutils_mgauss._validation import as_choice, as_integer, as_real
 from photutils_mgauss.matching import Tolerance
 
 __all__ = ['Epoch', 'MotionSolution', 'ProperMotionFitter',
-           'decode_motion_flags']
+           'bootstrap_median', 'decode_motion_flags']
 
 RECIPES = ('joint', 'two-step', 'paper')
 POINTING = 2000.0  # mas: offsets of exposures that are looked for
@@ -124,6 +134,104 @@ class MotionSolution:
         return residual_table(self._fit)
 
 
+    @property
+    def sky(self):
+        """
+        The stars as a `~astropy.coordinates.SkyCoord` with motions.
+
+        ICRS, at the reference epoch; None for planes without sky.
+        """
+        if 'ra' not in self.stars.colnames:
+            return None
+        return SkyCoord(self.stars['ra'], self.stars['dec'],
+                        pm_ra_cosdec=self.stars['pmra'],
+                        pm_dec=self.stars['pmdec'], frame='icrs',
+                        obstime=tdb(self.stars['ref_epoch'][0].value))
+
+    def at(self, time):
+        """
+        Return the stars at another epoch, with the covariances of then.
+
+        Parameters
+        ----------
+        time : `~astropy.time.Time` or float
+            The new reference epoch.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            Like ``stars``. Positions move along straight lines on the
+            tangent plane, which are great circles; their errors grow away
+            from the epochs observed, as the correlations say.
+        """
+        return star_table(self._fit, float(julian_years(time)))
+
+    def covariance(self, ids):
+        """
+        Return the covariances within and between some stars.
+
+        Parameters
+        ----------
+        ids : (k,) array_like
+            Identifiers of at most some hundred stars.
+
+        Returns
+        -------
+        (k, p, k, p) `~numpy.ndarray`
+            For the p parameters ``ra``, ``dec``, ``parallax`` (if fitted),
+            ``pmra`` and ``pmdec`` at the reference epoch [mas, mas / yr].
+            What two stars share is the error of the frames.
+
+        Raises
+        ------
+        ValueError
+            If a star is unknown, or motions are relative.
+        """
+        if self._fit.scene.relative:
+            msg = ('references must be given for covariances between '
+                   'stars, got relative motions')
+            raise ValueError(msg)
+        stars = _numbers_of(np.atleast_1d(ids), self.stars['id'])
+        return star_covariance(self._fit, stars, self._year)
+
+    def validation(self):
+        """
+        Compare the references held out with their catalogue.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            ``id``, ``dpmra`` and ``dpmdec`` (measured minus catalogue),
+            their errors, those of the catalogue included, and ``chi2`` of
+            two degrees of freedom.
+        """
+        return validation_table(self._fit, self.stars)
+
+    def bootstrap(self, n_resamples=10000, *, rng=None):
+        """
+        Resample the reference objects to see the error of the frames.
+
+        Parameters
+        ----------
+        n_resamples : int, optional
+            Number of resamplings.
+        rng : `~numpy.random.Generator` or int, optional
+            Source of the random draws.
+
+        Returns
+        -------
+        draws : object
+            ``draws.shift`` (n_resamples, E, 2) is the change of each map
+            at the centre of the field [mas], ``draws.motion``
+            (n_resamples, 2) that of all motions in common [mas / yr].
+        """
+        n = as_integer(n_resamples, 'n_resamples', minimum=1)
+        return bootstrap_frames(self._fit, n, rng)
+
+    @property
+    def _year(self):
+        return float(self.stars['ref_epoch'][0].value)
+
     def measured(self):
         """
         Return the stars as the detections alone have them.
@@ -137,9 +245,19 @@ class MotionSolution:
         estimates = solve_all(alone, result.frames.correction,
                               result.frames.factor,
                               result.scene.options.executor, residuals=True)
-        year = float(self.stars['ref_epoch'][0].value)
         return star_table(replace(result, problem=alone,
-                                  estimates=estimates), year)
+                                  estimates=estimates), self._year)
+
+
+def _numbers_of(ids, names):
+    """Return the rows of identifiers in a column."""
+    names = np.asarray(names)
+    missing = ~np.isin(ids, names)
+    if missing.any():
+        msg = f'ids must be those of stars, got {ids[missing][0]!r}'
+        raise ValueError(msg)
+    order = np.argsort(names)
+    return order[np.searchsorted(names, ids, sorter=order)]
 
 
 class ProperMotionFitter:
@@ -158,7 +276,8 @@ class ProperMotionFitter:
     recipe : {'joint', 'two-step', 'paper'}, optional
         'joint' solves for all stars and frames together; 'two-step' finds
         the frames from the references alone; 'paper' is the recipe of
-        Nie et al., Eqs. 11-15.
+        Nie et al., Eqs. 11-15, whose frames differ by shifts, whatever
+        ``transform`` is, and which fits no parallaxes.
     references : `~astropy.table.Table`, sequence or str, optional
         Objects whose motions are known. A table with ``id`` or ``ra`` and
         ``dec`` (``x`` and ``y`` for planes), ``pmra``, ``pmdec``,
@@ -276,15 +395,20 @@ class ProperMotionFitter:
         sightings = tie_planes(sightings,
                                [epoch.is_sky for epoch in epochs],
                                options.transform)
-        return self._solution(epochs, fit(*prepare(sightings, epochs,
-                                                   options)))
+        scene, state = prepare(sightings, epochs, options)
+        if options.recipe == 'paper':
+            result = fit_paper(scene, state, self.eps_t)
+        else:
+            result = fit(scene, state)
+        return self._solution(epochs, result)
 
     def _solution(self, epochs, result):
         year = result.scene.working_year
         if self.ref_epoch is not None:
             year = float(julian_years(self.ref_epoch, 'ref_epoch'))
-        return MotionSolution(star_table(result, year), list(epochs),
-                              alignment_table(result),
+        corrected, residuals = _corrected(epochs, result)
+        return MotionSolution(star_table(result, year), corrected,
+                              alignment_table(result, residuals),
                               result.frames.undetermined, result)
 
     def _match(self):
@@ -315,6 +439,21 @@ class ProperMotionFitter:
                        _systematic(self.systematic, unit), clip,
                        self._match().tolerance(unit).max_motion, held,
                        self.rng, self.executor)
+
+
+def _corrected(epochs, result):
+    """Return the epochs with corrected WCS, and the residuals of those."""
+    scene = result.scene
+    plane = scene.sightings.plane
+    if plane is None or scene.transform.kind == 'none':
+        return list(epochs), [np.nan] * len(epochs)
+    pairs = [correct_epoch(
+        epoch, Correction(plane, scene.transform, coefficients,
+                          observer_velocity(epoch.observer)), tie)
+             for epoch, coefficients, tie in zip(
+                 epochs, result.state.maps, scene.sightings.ties,
+                 strict=True)]
+    return tuple(list(some) for some in zip(*pairs, strict=True))
 
 
 def _check_quantity(value, name, *units):

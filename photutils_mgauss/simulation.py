@@ -6,56 +6,45 @@ current; the readout adds noise, a bias and the rounding of counts, and
 saturated pixels hold a full well. What comes back is what a pipeline would
 make of it: bias and dark removed, in electrons, with the sky left in.
 
-An image is made of bands of rows, each with random numbers of its own, so
-that a seed gives the same pixels with any number of threads.
+A seed gives the same pixels with any number of threads.
 """
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 
 import astropy.units as u
 import numpy as np
 from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import QTable
 
-from photutils_mgauss import _kernels
-from photutils_mgauss._detector_effects import (
-    SATURATED,
-    DetectorEffects,
-    add_cosmic_rays,
-    bleed,
-    pattern,
-    respond,
+from photutils_mgauss._detector_effects import DetectorEffects
+from photutils_mgauss._simulation_bound import (
+    SimulatedCatalogue,
+    covariances,
+    draw_table,
 )
-from photutils_mgauss._parallel import available_cores
+from photutils_mgauss._simulation_brush import brush_of, widen
 from photutils_mgauss._simulation_catalogues import (
     PAPER_DENSITY,
     crowded_field,
     sky_field,
     sparse_field,
 )
+from photutils_mgauss._simulation_image import Chip, draw, expose, read
 from photutils_mgauss._simulation_instrument import (
     CSST_BANDS,
     Band,
     Instrument,
 )
+from photutils_mgauss._simulation_optics import Optics
 from photutils_mgauss._simulation_psf import csst_psf
 from photutils_mgauss._simulation_sky import Exposure, paper_exposures
 from photutils_mgauss._validation import as_floats, as_real, as_shape
 from photutils_mgauss.gridded import GriddedMixturePSF
 
-__all__ = ['CSST_BANDS', 'PAPER_DENSITY', 'Band', 'DetectorEffects',
-           'Exposure', 'Instrument',
-           'Scene', 'crowded_field', 'csst_psf', 'paper_exposures',
-           'render_stars', 'simulate', 'simulate_epochs', 'sky_field',
-           'sparse_field']
-
-# Rows that share a random stream. It is part of what a seed means.
-_BAND_ROWS = 128
-
-# Gaussians are drawn where they exceed this [electron]: a thousandth of the
-# noise of the faintest pixel.
-_FAINTEST = 1e-3
+__all__ = [
+    'CSST_BANDS', 'PAPER_DENSITY', 'Band', 'DetectorEffects', 'Exposure',
+    'Instrument', 'Optics', 'Scene', 'SimulatedCatalogue', 'crowded_field',
+    'csst_psf', 'paper_exposures', 'render_stars', 'simulate',
+    'simulate_catalogues', 'simulate_epochs', 'sky_field', 'sparse_field']
 
 # Sources farther than this from the image are not part of its truth [pix].
 _MARGIN = 64
@@ -80,7 +69,7 @@ class Scene:
         The sources on the image and close to it: ``id``, ``x``, ``y``
         [pix], ``flux`` [electron], ``mag``, ``inside``, and the other
         columns of the catalogue.
-    psf : GriddedMixturePSF
+    psf : GriddedMixturePSF or `~photutils.psf.GriddedPSFModel`
         The true PSF.
     background : float
         The sky in each pixel [electron].
@@ -134,6 +123,37 @@ class Scene:
                       uncertainty=StdDevUncertainty(self.error),
                       wcs=self.wcs, meta=meta)
 
+    def write(self, path, *, layout='extensions', overwrite=False):
+        """
+        Write the scene to files, the way a pipeline does.
+
+        Parameters
+        ----------
+        path : str or `~pathlib.Path`
+            The name of the image, or what the names of all begin with.
+        layout : {'extensions', 'csst'}, optional
+            One FITS file with the extensions SCI, ERR and DQ [electron]; or
+            three with the image [electron / s], the flags (``_flg``) and the
+            weights (``_wht``, the inverse variance, 0 where a pixel is bad).
+        overwrite : bool, optional
+            Whether to replace existing files.
+
+        Returns
+        -------
+        list of `~pathlib.Path`
+            The images, the truth (``_truth.ecsv``) and the WCS
+            (``_wcs.asdf``); the headers have the WCS too, as TAN-SIP.
+
+        Raises
+        ------
+        ValueError
+            If the layout is unknown.
+        FileExistsError
+            If a file is there and ``overwrite`` is not set.
+        """
+        from photutils_mgauss._scene_files import write_scene
+        return write_scene(self, path, layout, overwrite)
+
 
 def simulate(sources, exposure=None, *, instrument=None, psf=None,
              effects=None, rng, executor=None):
@@ -151,7 +171,7 @@ def simulate(sources, exposure=None, *, instrument=None, psf=None,
         When, where and in which band; by default `Exposure()`.
     instrument : Instrument, optional
         The camera; its ``shape`` is the size of the image.
-    psf : GriddedMixturePSF, optional
+    psf : GriddedMixturePSF or `~photutils.psf.GriddedPSFModel`, optional
         The PSF; by default the `csst_psf` of the band and detector.
     effects : DetectorEffects, optional
         The imperfections of the detector; by default it has none.
@@ -183,15 +203,14 @@ def simulate(sources, exposure=None, *, instrument=None, psf=None,
     exposure = Exposure() if exposure is None else exposure
     instrument = Instrument() if instrument is None else instrument
     if psf is None:
-        psf = csst_psf(instrument.shape, exposure.band,
-                       rng=exposure.detector)
+        psf, = _each_psf(None, [exposure], instrument)
     effects = DetectorEffects() if effects is None else effects
-    psf = effects.widen(psf)
+    psf = widen(psf, effects.charge_diffusion)
     wcs = exposure.wcs(instrument.shape, instrument.pixel_scale)
     truth = _truth(sources, exposure, instrument, wcs)
-    chip = _Chip(instrument, effects, exposure)
-    electrons, flags = _expose(chip, truth, psf, rng, executor)
-    image, error = _read(chip, electrons, rng, executor)
+    chip = Chip(instrument, effects, exposure)
+    electrons, flags = expose(chip, truth, psf, rng, executor)
+    image, error = read(chip, electrons, rng, executor)
     return Scene(image, error, flags, truth, psf, chip.sky, exposure,
                  instrument, wcs)
 
@@ -209,7 +228,7 @@ def simulate_epochs(sources, exposures, *, instrument=None, psfs=None,
         For example those of `paper_exposures`.
     instrument, effects, executor
         As for `simulate`.
-    psfs : sequence of GriddedMixturePSF, optional
+    psfs : sequence, optional
         The PSF of each exposure; by default the `csst_psf` of its band and
         detector.
     rng : int or `~numpy.random.Generator`
@@ -235,16 +254,93 @@ def simulate_epochs(sources, exposures, *, instrument=None, psfs=None,
     ['2024-12-12', '2026-05-30', '2026-08-11']
     """
     exposures = list(exposures)
-    psfs = [None] * len(exposures) if psfs is None else list(psfs)
-    if len(psfs) != len(exposures):
-        msg = (f'psfs must have one element for each of {len(exposures)} '
-               f'exposures, got {len(psfs)}')
-        raise ValueError(msg)
+    instrument = Instrument() if instrument is None else instrument
+    psfs = _each_psf(psfs, exposures, instrument)
     seeds = np.random.default_rng(rng).spawn(len(exposures))
     return [simulate(sources, exposure, instrument=instrument, psf=psf,
                      effects=effects, rng=seed, executor=executor)
             for exposure, psf, seed in zip(exposures, psfs, seeds,
                                            strict=True)]
+
+
+def simulate_catalogues(sources, exposures, *, instrument=None, psfs=None,
+                        threshold=5.0, rng, executor=None):
+    """
+    Measure sources as well as they can be, without making images.
+
+    Positions and fluxes scatter with the Cramer-Rao bound of an isolated
+    star.
+
+    Parameters
+    ----------
+    sources, exposures, instrument, psfs
+        As for `simulate_epochs`.
+    threshold : float, optional
+        Sources of a lower flux over its error are left out.
+    rng : int or `~numpy.random.Generator`
+        The seed of the errors.
+    executor : `~concurrent.futures.Executor`, optional
+        Where sources are measured; by default a pool of threads.
+
+    Returns
+    -------
+    list of SimulatedCatalogue
+        Only sources inside the image and below the full well.
+
+    Raises
+    ------
+    ValueError
+        As for `simulate_epochs`.
+
+    Examples
+    --------
+    >>> from photutils_mgauss.simulation import (
+    ...     Instrument, paper_exposures, simulate_catalogues, sky_field)
+    >>> sources = sky_field(20, 10, size=0.25, rng=1, magnitudes=(20, 24))
+    >>> catalogues = simulate_catalogues(
+    ...     sources, paper_exposures()[:2], rng=2,
+    ...     instrument=Instrument(shape=(300, 300)))
+    >>> [len(catalogue.table) for catalogue in catalogues]
+    [30, 30]
+    """
+    exposures = list(exposures)
+    instrument = Instrument() if instrument is None else instrument
+    psfs = _each_psf(psfs, exposures, instrument)
+    seeds = np.random.default_rng(rng).spawn(len(exposures))
+    return [_catalogue(sources, exposure, instrument, psf, threshold, seed,
+                       executor)
+            for exposure, psf, seed in zip(exposures, psfs, seeds,
+                                           strict=True)]
+
+
+def _catalogue(sources, exposure, instrument, psf, threshold, rng, executor):
+    wcs = exposure.wcs(instrument.shape, instrument.pixel_scale)
+    truth = _truth(sources, exposure, instrument, wcs)
+    sky = instrument.sky(exposure.band)
+    flux = truth['flux'].value
+    peak = brush_of(psf).peak
+    truth = truth[truth['inside'] & (flux > 0)
+                  & (flux * peak + sky < instrument.full_well)]
+    bounds = covariances(
+        psf, *(truth[name].value for name in ('x', 'y', 'flux')),
+        sky + instrument.dark_level + instrument.readout_variance, executor)
+    bright = truth['flux'].value >= threshold * np.sqrt(bounds[:, 2, 2])
+    truth = truth[bright]
+    return SimulatedCatalogue(draw_table(truth, bounds[bright], rng), truth,
+                              wcs, exposure.time)
+
+
+def _each_psf(psfs, exposures, instrument):
+    """Return one PSF for each exposure."""
+    if psfs is None:
+        return [csst_psf(instrument.shape, exposure.band,
+                         rng=exposure.detector) for exposure in exposures]
+    psfs = list(psfs)
+    if len(psfs) != len(exposures):
+        msg = (f'psfs must have one element for each of {len(exposures)} '
+               f'exposures, got {len(psfs)}')
+        raise ValueError(msg)
+    return psfs
 
 
 def render_stars(psf, x, y, flux, shape, *, faintest=1e-3, executor=None):
@@ -253,7 +349,7 @@ def render_stars(psf, x, y, flux, shape, *, faintest=1e-3, executor=None):
 
     Parameters
     ----------
-    psf : GriddedMixturePSF
+    psf : GriddedMixturePSF or `~photutils.psf.GriddedPSFModel`
         The PSF.
     x, y, flux : (n,) array_like
         Positions [pix] and fluxes. Stars may be outside the image.
@@ -288,148 +384,7 @@ def render_stars(psf, x, y, flux, shape, *, faintest=1e-3, executor=None):
     flux = as_floats(flux, 'flux', shape=x.shape)
     shape = as_shape(shape, 'shape')
     faintest = as_real(faintest, 'faintest', above=0)
-    image = np.zeros(shape)
-    bands = _row_bands(shape)
-    parts = _split(psf, x, y, flux, bands, faintest)
-    draw = partial(_render, psf, shape[1], faintest)
-    for band, part in zip(bands, _run(draw, executor, bands, parts),
-                          strict=True):
-        image[band] = part
-    return image
-
-
-def _row_bands(shape):
-    """Return slices of the rows of an image."""
-    ny = shape[0]
-    return [slice(start, min(start + _BAND_ROWS, ny))
-            for start in range(0, ny, _BAND_ROWS)]
-
-
-def _run(function, executor, *columns):
-    """Map a function over columns of arguments, in threads by default."""
-    if executor is not None:
-        yield from executor.map(function, *columns)
-        return
-    with ThreadPoolExecutor(available_cores()) as pool:
-        yield from pool.map(function, *columns)
-
-
-def _split(psf, x, y, flux, bands, faintest):
-    """Yield, for each band, the stars (3, n) that may reach it."""
-    # By y, so that each band finds its stars, and the sum over stars in
-    # each pixel has one order.
-    order = np.argsort(y, kind='stable')
-    stars = np.stack([x, y, flux])[:, order]
-    reach = _reach(psf._grid.rows, stars[2], faintest)
-    farthest = reach.max(initial=0)
-    for band in bands:
-        first, last = np.searchsorted(
-            stars[1], [band.start - farthest, band.stop + farthest])
-        near = slice(first, last)
-        distance = np.maximum(band.start - stars[1, near],
-                              stars[1, near] - band.stop)
-        yield stars[:, near][:, distance <= reach[near]]
-
-
-def _reach(rows, flux, faintest):
-    """Return how far along y a star of each flux can be drawn (n,) [pix]."""
-    peak = np.abs(rows[..., 0]).max(axis=0)
-    stddev = 1 / np.sqrt(rows[..., 5].min(axis=0))
-    offset = np.abs(rows[..., 2]).max()
-    reach = np.zeros_like(flux)
-    for height, sigma in zip(peak, stddev, strict=True):
-        ratio = np.maximum(np.abs(flux) * height / faintest,
-                           1 / _kernels._DEPTH)
-        reach = np.maximum(reach, sigma * np.sqrt(2 * np.log(ratio)))
-    return reach + offset + 1
-
-
-def _render(psf, width, faintest, band, stars):
-    """Return the expected light (rows, width) of stars in a band of rows."""
-    out = np.zeros((band.stop - band.start, width))
-    grid = psf._grid
-    x, y, flux = np.ascontiguousarray(stars)
-    _kernels.render_image(x, y, flux, grid.rows, grid.x_grid, grid.y_grid,
-                          psf.pixel_integrated, faintest, float(band.start),
-                          out)
-    return out
-
-
-@dataclass(frozen=True, eq=False)
-class _Chip:
-    """A detector during an exposure."""
-
-    instrument: Instrument
-    effects: DetectorEffects
-    exposure: Exposure
-
-    @property
-    def bands(self):
-        """The bands of rows it is made in."""
-        return _row_bands(self.instrument.shape)
-
-    @property
-    def sky(self):
-        """The light of the sky in a pixel [electron]."""
-        return self.instrument.sky(self.exposure.band)
-
-    def pattern(self, band):
-        """Return what is fixed about a band of rows."""
-        return pattern(self.effects, self.exposure.detector, band,
-                       self.instrument.shape[1])
-
-
-def _expose(chip, truth, psf, rng, executor):
-    """Return the electrons in each pixel, at most a full well, and flags."""
-    x, y, flux = (truth[name].value for name in ('x', 'y', 'flux'))
-    electrons = np.empty(chip.instrument.shape, np.float32)
-    flags = np.empty(chip.instrument.shape, np.uint8)
-    parts = _run(partial(_expose_band, chip, psf), executor, chip.bands,
-                 _split(psf, x, y, flux, chip.bands, _FAINTEST),
-                 rng.spawn(len(chip.bands)))
-    for band, part in zip(chip.bands, parts, strict=True):
-        electrons[band], flags[band] = part
-    add_cosmic_rays(electrons, flags, chip.effects,
-                    chip.instrument.exposure_time, rng)
-    full_well = chip.instrument.full_well
-    if chip.effects.bleeding:
-        bleed(electrons, full_well)
-    flags |= np.where(electrons >= full_well, SATURATED, 0).astype(np.uint8)
-    np.minimum(electrons, np.float32(full_well), out=electrons)
-    return electrons, flags
-
-
-def _expose_band(chip, psf, band, stars, rng):
-    """Return the electrons and flags of a band of rows."""
-    instrument, fixed = chip.instrument, chip.pattern(band)
-    expected = _render(psf, instrument.shape[1], _FAINTEST, band, stars)
-    expected += chip.sky
-    expected *= fixed.response
-    expected += instrument.dark_level
-    expected += fixed.dark * instrument.exposure_time
-    return rng.poisson(expected).astype(np.float32), fixed.flags
-
-
-def _read(chip, electrons, rng, executor):
-    """Return the image that a pipeline makes of the electrons, and error."""
-    image = np.empty(electrons.shape, np.float32)
-    error = np.empty(electrons.shape, np.float32)
-    parts = _run(partial(_read_band, chip), executor, chip.bands,
-                 (electrons[band] for band in chip.bands),
-                 rng.spawn(len(chip.bands)))
-    for band, part in zip(chip.bands, parts, strict=True):
-        image[band], error[band] = part
-    return image, error
-
-
-def _read_band(chip, band, electrons, rng):
-    instrument, flat = chip.instrument, chip.pattern(band).flat
-    charge = respond(electrons, chip.effects, instrument.full_well)
-    noise = instrument.read_noise * rng.standard_normal(charge.shape)
-    counts = np.rint((charge + noise + instrument.bias) / instrument.gain)
-    level = counts * instrument.gain - instrument.bias
-    variance = np.maximum(level, 0) + instrument.readout_variance
-    return (level - instrument.dark_level) / flat, np.sqrt(variance) / flat
+    return draw(psf, x, y, flux, shape, faintest, executor)
 
 
 def _truth(sources, exposure, instrument, wcs):

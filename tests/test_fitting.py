@@ -14,6 +14,7 @@ from photutils_mgauss import (
     adaptive_moments,
     fit_mixture,
 )
+from photutils_mgauss._phases import phase_error, phase_rows
 from photutils_mgauss._stamps import Workspace
 
 TRUTH = GaussianMixture.from_stddevs(
@@ -84,21 +85,25 @@ def test_pixels_that_are_masked_or_have_no_weight_do_not_matter():
     assert_same_psf(fit_mixture(damaged, 3, mask=mask).mixture, TRUTH)
 
 
-def test_the_normal_equations_are_those_of_the_finite_differences(rng):
+@pytest.mark.parametrize('n_rows', [0, 2])
+def test_the_normal_equations_are_those_of_finite_differences(rng, n_rows):
     k, shape, centre = 3, (20, 22), np.array([10.0, 9.0])
     shapes = np.column_stack([rng.normal(0, 1, (k, 2)),
                               -np.log([1.5, 2, 3]), rng.normal(0, 0.2, k),
                               -np.log([1.3, 2.5, 3])])
     weight, stamp = rng.uniform(0.5, 2, shape), rng.normal(0, 1, shape)
     fluxes, space = np.empty(k), Workspace(k, shape)
-    _kernels.project(stamp, weight, centre, shapes, (0.0, 0.0), True, fluxes,
-                     space.scratch)
+    rows = rng.normal(0, 1, (n_rows, *shape))
+    _kernels.project(stamp, weight, centre, shapes, (0.0, 0.0), True, rows,
+                     fluxes, space.scratch)
 
     def residual(values):
         images = np.empty((k, *shape))
         _kernels.draw_unit(values[k:].reshape(k, 5), *centre, images)
         model = np.tensordot(values[:k], images, 1)
-        return (np.sqrt(weight) * (stamp - model)).ravel()
+        left = stamp - model
+        return np.concatenate([(np.sqrt(weight) * left).ravel(),
+                               np.tensordot(rows, left, 2)])
 
     values = np.concatenate([fluxes, shapes.ravel()])
     step = 1e-6 * np.eye(values.size)
@@ -106,7 +111,7 @@ def test_the_normal_equations_are_those_of_the_finite_differences(rng):
                          for h in step]) / 2e-6
     matrix, gradient = np.empty((6 * k, 6 * k)), np.empty(6 * k)
     _kernels.normal_equations(weight, centre, shapes, fluxes, (0.0, 0.0),
-                              space.scratch, matrix, gradient)
+                              rows, space.scratch, matrix, gradient)
     assert_allclose(matrix, jacobian @ jacobian.T, rtol=1e-6,
                     atol=1e-7 * matrix.max())
     assert_allclose(gradient, -jacobian @ residual(values), rtol=1e-6,
@@ -360,3 +365,60 @@ def test_a_masked_border_does_not_touch_the_fit(f814w):
     inner = fit_mixture(node[1:-1, 1:-1], 3, oversampling=4)
     assert_allclose(fit.flux, inner.flux, rtol=0.01)
     assert_same_psf(fit.mixture, inner.mixture, atol=0.01)
+
+
+def centroid_errors(mixture, epsf, size, oversampling):
+    """Fit noise-free stars at the phases of an ePSF; return errors (n, 2)."""
+    middle, half = epsf.shape[0] // 2, size // 2
+    y, x = np.mgrid[-half:half + 1, -half:half + 1]
+    steps = oversampling * np.arange(-half, half + 1)
+    errors = []
+    for j in range(oversampling):
+        for i in range(oversampling):
+            star = epsf[np.ix_(middle + steps - j, middle + steps - i)]
+            phase = np.array([i, j]) / oversampling
+
+            def residual(p, star=star):
+                return (p[2] * mixture.evaluate(x - p[0], y - p[1])
+                        - star).ravel()
+
+            fit = least_squares(residual, [*phase, 1], xtol=1e-12, ftol=1e-12)
+            errors.append(fit.x[:2] - phase)
+    return np.array(errors) - np.mean(errors, axis=0)
+
+
+@pytest.mark.filterwarnings('ignore:non-ASCII characters',
+                            'ignore:The following header keyword')
+def test_astrometric_weighting_removes_the_pixel_phase_error(f814w):
+    node = f814w[24]
+    image = node[30:71, 30:71]
+    errors = {}
+    for weighting in ('uniform', 'astrometric'):
+        fit = fit_mixture(image, 3, oversampling=4, weighting=weighting)
+        errors[weighting] = [np.sqrt(np.mean(centroid_errors(
+            fit.mixture, node, size, 4)**2)) for size in (5, 7)]
+    assert min(errors['uniform']) > 5e-3
+    assert max(errors['astrometric']) < 1e-3
+
+
+@pytest.mark.filterwarnings('ignore:non-ASCII characters',
+                            'ignore:The following header keyword')
+def test_pixel_phase_errors_are_linear_in_the_residual(f814w):
+    image = f814w[24, 30:71, 30:71]
+    fit = fit_mixture(image, 5, oversampling=4)
+    rows = phase_rows(fit.mixture, fit.flux, image.shape, np.array([4., 4.]),
+                      np.array([20., 20.]), fit.used, sizes=(5,))
+    fitted = centroid_errors(fit.mixture, f814w[24], 5, 4)
+    assert_allclose(phase_error(rows, fit.residual)[0],
+                    np.sqrt((fitted**2).mean()), rtol=0.1)
+
+
+def test_astrometric_weighting_keeps_an_exact_fit_exact():
+    image = image_of(TRUTH, (61, 61), oversampling=(2, 2))
+    fit = fit_mixture(image, 3, oversampling=2, weighting='astrometric')
+    assert_same_psf(fit.mixture, TRUTH)
+
+
+def test_astrometric_weighting_needs_more_than_native_pixels():
+    with pytest.raises(ValueError, match='oversampling must be at least 2'):
+        fit_mixture(image_of(TRUTH), 3, weighting='astrometric')

@@ -1,4 +1,6 @@
 """ProperMotionFitter beside the truth, published values and other fits."""
+from concurrent.futures import ThreadPoolExecutor
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from numpy.testing import assert_allclose
 from photutils_mgauss import (
     Epoch,
     ProperMotionFitter,
+    bootstrap_median,
     decode_motion_flags,
 )
 
@@ -604,3 +607,207 @@ def test_residuals_are_those_of_the_aligned_positions(solution):
                                                         rel=0.05)
     bigger = np.abs(used['dra_left_out']) >= np.abs(used['dra']) * 0.999
     assert bigger[np.isfinite(used['dra_left_out'])].mean() > 0.95
+
+
+# What can be asked of a solution
+
+def test_propagated_positions_and_errors_follow_the_motion(solution):
+    later = solution.at(2035.0)
+    years = 2035.0 - solution.stars['ref_epoch'][0].value
+    start, end = (SkyCoord(one['ra'], one['dec'])
+                  for one in (solution.stars, later))
+    moved = start.spherical_offsets_to(end)
+    for angle, name in zip(moved, ('ra', 'dec'), strict=True):
+        assert_allclose(angle.to_value(u.mas), years
+                        * solution.stars[f'pm{name}'].value, atol=1e-3)
+        # sigma(t)^2 = sigma_x^2 + 2 t cov + t^2 sigma_mu^2
+        place, motion = (solution.stars[key].value
+                         for key in (f'{name}_error', f'pm{name}_error'))
+        rho = solution.stars[f'{name}_pm{name}_corr']
+        expected = np.sqrt(place**2 + 2 * years * rho * place * motion
+                           + years**2 * motion**2)
+        assert_allclose(later[f'{name}_error'].value, expected, rtol=1e-6)
+
+
+def test_stars_go_into_a_skycoord_with_their_motions(solution):
+    sky = solution.sky
+    assert_allclose(sky.pm_ra_cosdec.value, solution.stars['pmra'].value)
+    assert_allclose(sky.obstime.jyear, solution.stars['ref_epoch'][0].value)
+
+
+def test_the_mean_of_a_field_scatters_by_the_covariance_between_stars():
+    """The frames' error is common: it does not average out over stars."""
+    pull, alone = [], []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        truth = make_truth(rng, n_stars=40, n_qso=12, sigma=1.0)
+        fit = ProperMotionFitter(references='qso', transform='shift',
+                                 systematic=None, clip=None).fit(
+            observe(truth, rng, times=TIMES[[0, 3, 6]], missing=0))
+        ids = np.flatnonzero(~truth.qso)
+        covariance = fit.covariance(ids)[:, 2, :, 2]
+        stars = fit.stars[np.isin(fit.stars['id'], ids)]
+        away = np.mean(stars['pmra'].value - truth.pm[0, stars['id']])
+        pull.append(away / np.sqrt(covariance.mean()))
+        alone.append(away / np.sqrt(np.diag(covariance).mean() / 40))
+        order = np.argsort(stars['id'])
+        assert_allclose(np.sqrt(np.diag(covariance)),
+                        stars['pmra_error'].value[order], rtol=1e-6)
+    assert_allclose(rms(pull), 1, atol=0.3)
+    assert rms(alone) > 1.5
+
+
+def test_covariances_of_unknown_stars_or_relative_motions_raise(solution,
+                                                                scene):
+    with pytest.raises(ValueError, match='ids must be those of stars'):
+        solution.covariance([123456])
+    relative = ProperMotionFitter().fit(scene[1])
+    with pytest.raises(ValueError, match='references must be given'):
+        relative.covariance([1])
+
+
+def test_references_held_out_agree_with_their_catalogue(scene, quasars):
+    fit = ProperMotionFitter(references=quasars, hold_out=0.4,
+                             rng=1).fit(scene[1])
+    table = fit.validation()
+    assert len(table) == 120
+    assert_allclose(np.mean(table['chi2']), 2, atol=0.5)
+    assert np.sum(fit.stars['flags'] & 64 > 0) == 120
+    assert (fit.alignment['n_references'] <= 180).all()
+
+
+def test_resampled_references_show_the_error_of_the_frames():
+    rng = np.random.default_rng(4)
+    truth = make_truth(rng, n_stars=100, n_qso=150, sigma=1.0)
+    fit = ProperMotionFitter(references='qso', transform='shift',
+                             recipe='two-step', systematic=None).fit(
+        observe(truth, rng))
+    draws = fit.bootstrap(10000, rng=5)
+    assert draws.motion.shape == (10000, 2)
+    ids = np.flatnonzero(~truth.qso)
+    common = fit.covariance(ids)[:, 2, :, 2]
+    off = common[~np.eye(len(ids), dtype=bool)].mean()
+    assert_allclose(draws.motion[:, 0].std(), np.sqrt(off), rtol=0.2)
+    assert_allclose(draws.motion.mean(axis=0), 0, atol=0.1 * np.sqrt(off))
+
+
+def test_resampled_medians_scatter_like_medians(rng):
+    values = rng.normal(size=1000)
+    draws = bootstrap_median(values, n_resamples=4000, rng=3)
+    assert_allclose(draws.std(), np.sqrt(np.pi / 2 / 1000), rtol=0.15)
+    again = bootstrap_median(values, n_resamples=4000, rng=3)
+    assert_allclose(again, draws)
+    with pytest.raises(ValueError, match='at least 2'):
+        bootstrap_median([1.0, np.nan])
+
+
+def test_an_ignored_parallax_biases_the_motion_as_the_table_says():
+    rng = np.random.default_rng(6)
+    truth = make_truth(rng, n_stars=100, n_qso=100, parallax=10.0, sigma=0.1)
+    fit = ProperMotionFitter(references='qso', transform='shift', clip=None,
+                             systematic=None).fit(
+        observe(truth, rng, missing=0))
+    stars = fit.stars[~truth.qso[np.asarray(fit.stars['id'])]]
+    for k, name in enumerate(('pmra', 'pmdec')):
+        bias = stars[name].value - truth.pm[k, stars['id']]
+        expected = stars[f'{name}_per_parallax'].value * 10.0
+        assert_allclose(bias, expected, atol=0.3)
+    # Bias per mas of parallax with the cadence of Nie et al.
+    assert_allclose(np.median(fit.stars['pmra_per_parallax'].value), -0.43,
+                    atol=0.06)
+    assert (stars['flags'] & 128 > 0).mean() > 0.9
+
+
+def test_a_parallax_prior_lies_between_none_and_a_free_parallax():
+    rng = np.random.default_rng(7)
+    truth = make_truth(rng, n_stars=500, n_qso=200,
+                       parallax=rng.normal(0.5, 0.5, 700))
+    epochs = observe(truth, rng)
+    size = {}
+    for parallax in (False, 'prior', True):
+        fit = ProperMotionFitter(references='qso', parallax=parallax).fit(
+            epochs)
+        stars = fit.stars[~truth.qso[np.asarray(fit.stars['id'])]]
+        size[parallax] = np.nanmedian(stars['pmra_error'].value)
+        if parallax:
+            assert_allclose(rms(pulls(stars, truth)), 1, atol=0.06)
+    assert size[False] < size['prior'] < size[True]
+
+
+def test_accelerations_are_found(rng):
+    years = (2020.0, 2021.0, 2022.0, 2023.0, 2024.0)
+    epochs, _ = plane_epochs(rng, years=years, error=1e-4)
+    for epoch in epochs:
+        dt = epoch.mean_year - 2022.0
+        epoch.table['x_fit'][:5] += 0.5 * 0.02 * dt**2
+    fit = ProperMotionFitter(transform='shift', references=list(range(20, 40)),
+                             acceleration=True, clip=None, systematic=None)
+    table = fit.fit([changed(epoch, x_fit=np.where(
+        np.arange(40) >= 20, epochs[0].table['x_fit'], epoch.table['x_fit']),
+        y_fit=np.where(np.arange(40) >= 20, epochs[0].table['y_fit'],
+                       epoch.table['y_fit'])) for epoch in epochs]).stars
+    assert_allclose(table['accra'].value[:5], 0.02, atol=5e-4)
+    assert_allclose(table['accra'].value[5:20], 0, atol=5e-4)
+
+
+def test_a_known_perspective_acceleration_is_taken_out():
+    """A nearby star that recedes: its motion slows down."""
+    from photutils_mgauss._references import perspective, read_catalogue
+    star = Table({'id': [1], 'class': ['star'], 'ra': [269.45],
+                  'dec': [4.69], 'pmra': [-801.6], 'pmdec': [10362.4],
+                  'parallax': [546.98], 'radial_velocity': [-110.5],
+                  'ref_epoch': [2016.0]})
+    rate = perspective(read_catalogue(star, None, 'mas'))
+    # Barnard's star gains 1.3 mas / yr^2.
+    assert_allclose(np.hypot(*rate[:, 0]), 1.28, atol=0.03)
+    assert rate[1, 0] > 0
+
+
+def test_the_floor_of_an_epoch_is_found(rng):
+    truth = make_truth(rng, n_stars=300, n_qso=300, sigma=1.0)
+    times = list(TIMES[[0, 2, 3, 4, 6]])
+    epochs = observe(truth, rng, times=times, missing=0)
+    noisy = epochs[2].table.copy()
+    for name in ('x_fit', 'y_fit'):
+        noisy[name] += rng.normal(0, 3.0 / 74, len(noisy))
+    epochs[2] = Epoch(noisy, epochs[2].wcs, epochs[2].time)
+    fit = ProperMotionFitter(references='qso').fit(epochs)
+    floor = fit.alignment['systematic'].value
+    assert_allclose(floor[2], 3.0, rtol=0.1)
+    assert (np.delete(floor, 2, axis=0) < 0.5).all()
+    stars = fit.stars[~truth.qso[np.asarray(fit.stars['id'])]]
+    assert_allclose(rms(pulls(stars, truth)), 1, atol=0.06)
+
+
+def test_matching_on_the_sky_gives_what_identifiers_give(scene, solution,
+                                                         quasars):
+    _, epochs = scene
+    fit = ProperMotionFitter(references=quasars, match_by='sky').fit(epochs)
+    both, i, j = np.intersect1d(fit.stars['id'], solution.stars['id'],
+                                return_indices=True)
+    assert len(both) > 2500
+    away = fit.stars['pmra'][i] - solution.stars['pmra'][j]
+    same = fit.stars['n_obs'][i] == solution.stars['n_obs'][j]
+    assert same.mean() > 0.98
+    assert np.nanmax(np.abs(away[same].value)) < 0.2
+
+
+def test_row_numbers_of_photutils_are_not_identifiers(scene):
+    _, epochs = scene
+    plain = [Epoch(epoch.table['x_fit', 'y_fit', 'x_err', 'y_err', 'qso'],
+                   epoch.wcs, epoch.time) for epoch in epochs[:3]]
+    numbered = [changed(epoch, id=np.arange(len(epoch.table)) + 1)
+                for epoch in plain]
+    one, two = (ProperMotionFitter(references='qso').fit(some).stars
+                for some in (plain, numbered))
+    assert len(one) == len(two)
+    assert_allclose(np.sort(one['pmra'].value), np.sort(two['pmra'].value))
+
+
+def test_threads_and_one_thread_agree_exactly(scene, quasars):
+    _, epochs = scene
+    with ThreadPoolExecutor(3) as pool:
+        one, two = (ProperMotionFitter(references=quasars,
+                                       executor=pool_).fit(epochs).stars
+                    for pool_ in (pool, None))
+    assert_allclose(one['pmra'].value, two['pmra'].value, rtol=0, atol=0)

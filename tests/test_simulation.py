@@ -1,20 +1,27 @@
 """Simulated scenes: what they must conserve, repeat and agree with."""
 from concurrent.futures import ThreadPoolExecutor
 
+import asdf
 import astropy.units as u
 import erfa
 import numpy as np
 import pytest
 from astropy.coordinates import Distance, SkyCoord
+from astropy.io import fits
 from astropy.table import QTable
 from astropy.time import Time
+from astropy.wcs import WCS as FITSWCS
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.ndimage import label
 
+from photutils_mgauss._detector_effects import bleed, pattern
+from photutils_mgauss._simulation_bound import covariances
 from photutils_mgauss.gridded import GriddedMixturePSF
 from photutils_mgauss.mixture import GaussianMixture
 from photutils_mgauss.simulation import (
     CSST_BANDS,
     Band,
+    DetectorEffects,
     Exposure,
     Instrument,
     crowded_field,
@@ -22,6 +29,7 @@ from photutils_mgauss.simulation import (
     paper_exposures,
     render_stars,
     simulate,
+    simulate_catalogues,
     simulate_epochs,
     sky_field,
     sparse_field,
@@ -87,11 +95,14 @@ def test_the_flux_centroid_of_the_psf_is_at_the_star():
     assert np.ptp(sizes) > 0.05 * np.mean(sizes)
 
 
+@pytest.mark.parametrize('interpolation', ['blend', 'components'])
 @pytest.mark.parametrize('integrated', [False, True])
-def test_many_stars_are_the_sum_of_stars_drawn_one_by_one(integrated, rng):
+def test_many_stars_are_the_sum_of_stars_drawn_one_by_one(
+        integrated, interpolation, rng):
     nodes = csst_psf((300, 200), variation=3)
     psf = GriddedMixturePSF(nodes.mixtures, nodes.grid_xypos,
-                            pixel_integrated=integrated)
+                            pixel_integrated=integrated,
+                            interpolation=interpolation)
     x = rng.uniform(-20, 220, 40)
     y = rng.uniform(-20, 320, 40)
     flux = 10 ** rng.uniform(1, 6, 40)
@@ -99,7 +110,7 @@ def test_many_stars_are_the_sum_of_stars_drawn_one_by_one(integrated, rng):
     expected = sum(psf.mixture_at(a, b).render(
         (300, 200), a, b, flux=f, pixel_integrated=integrated)
         for a, b, f in zip(x, y, flux, strict=True))
-    assert_allclose(image, expected, rtol=0, atol=3e-6 * image.max())
+    assert_allclose(image, expected, rtol=0, atol=2e-5 * image.max())
 
 
 def test_a_very_thin_gaussian_is_integrated_over_pixels():
@@ -159,17 +170,17 @@ def test_rows_and_tiles_have_noise_of_their_own():
 def test_the_variance_of_a_pixel_grows_with_its_light():
     camera = Instrument(shape=(21, 21))
     star = one_star(10.2, 9.9, 2e4)
-    images = np.stack([simulate(star, instrument=camera, rng=i).image
-                       for i in range(400)])
-    expected = render_stars(csst_psf((21, 21), rng=1), [10.2], [9.9], [2e4],
-                            (21, 21))
+    psf, n = csst_psf((21, 21)), 200
+    images = np.stack([simulate(star, instrument=camera, psf=psf, rng=i).image
+                       for i in range(n)])
+    expected = render_stars(psf, [10.2], [9.9], [2e4], (21, 21))
     level = expected + camera.sky(CSST_BANDS['g'])
     pulls = ((images.mean(axis=0) - level)
              / np.sqrt((level + camera.dark_level + camera.readout_variance)
-                       / 400))
+                       / n))
     assert abs(pulls.std() - 1) < 0.15
     variance = level + camera.dark_level + camera.readout_variance
-    assert_allclose(images.var(axis=0).sum(), variance.sum(), rtol=0.03)
+    assert_allclose(images.var(axis=0).sum(), variance.sum(), rtol=0.04)
 
 
 def test_values_are_whole_counts():
@@ -367,3 +378,235 @@ def test_a_distortion_of_higher_order_is_refused():
     distortion[0, 3, 1] = 1
     with pytest.raises(ValueError, match='distortion must be a cubic'):
         Exposure(distortion=distortion)
+
+
+# Detector effects.
+
+def test_without_effects_nothing_is_flagged_and_a_pattern_is_flat():
+    scene = simulate(one_star(30, 40, 1e4), instrument=SMALL, rng=1)
+    assert not scene.mask.any()
+    fixed = pattern(DetectorEffects(), 3, slice(0, 50), 60)
+    assert_array_equal(fixed.response, 1)
+    assert_array_equal(fixed.dark, 0)
+
+
+def test_bad_pixels_belong_to_the_detector_not_to_the_exposure():
+    effects = DetectorEffects(hot_pixels=1e-3, dead_pixels=1e-3,
+                              bad_columns=2)
+    flags = [simulate(one_star(30, 40, 1e4), Exposure(detector=detector),
+                      instrument=SMALL, effects=effects, rng=rng).flags
+             for detector, rng in ((8, 1), (8, 2), (9, 1))]
+    assert_array_equal(flags[0], flags[1])
+    assert (flags[0] != flags[2]).any()
+    columns = (flags[0] & 16).any(axis=0)
+    assert columns.sum() == 2
+    assert (flags[0][:, columns] & 16).all()
+    n = flags[0].size * 1e-3
+    for bit in (4, 8):
+        assert abs(((flags[0] & bit) != 0).sum() - n) < 5 * np.sqrt(n)
+
+
+def test_hot_pixels_are_bright_and_dead_ones_and_bad_columns_dark():
+    camera = Instrument(shape=(300, 300), exposure_time=600)
+    effects = DetectorEffects(hot_pixels=2e-3, dead_pixels=2e-3,
+                              bad_columns=2)
+    scene = simulate(one_star(-50, -50, 0), instrument=camera,
+                     effects=effects, rng=1)
+    level = {bit: scene.image[scene.flags == bit].mean()
+             for bit in (4, 8, 16)}
+    assert level[4] > scene.background + 1000
+    assert abs(level[8] - 0.05 * scene.background) < 3
+    assert abs(level[16] - 0.4 * scene.background) < 3
+    good = scene.image[~scene.mask]
+    assert abs(good.mean() - scene.background) < 0.2
+
+
+def test_the_response_of_pixels_is_removed_but_its_noise_stays():
+    camera = Instrument(shape=(300, 300))
+    scene = simulate(one_star(-50, -50, 0), instrument=camera, rng=1,
+                     effects=DetectorEffects(prnu=0.3))
+    plain = simulate(one_star(-50, -50, 0), instrument=camera, rng=1)
+    assert_allclose(np.median(scene.image), scene.background, atol=0.7)
+    assert scene.image.std() > 1.05 * plain.image.std()
+    pulls = (scene.image - scene.background) / scene.error
+    assert_allclose(pulls.std(), 1, atol=0.05)
+
+
+def test_cosmic_rays_come_at_their_rate_and_are_flagged():
+    camera = Instrument(shape=(1000, 1000))
+    scene = simulate(one_star(-50, -50, 0), instrument=camera, rng=1,
+                     effects=DetectorEffects(cosmic_rays=2.0))
+    hit = (scene.flags & 2) != 0
+    tracks = label(hit, np.ones((3, 3)))[1]
+    assert abs(tracks - 300) < 5 * np.sqrt(300)
+    excess = scene.image - scene.background
+    assert excess[hit].sum() / 300 > 1000
+    assert excess[~hit].max() < 6 * scene.error.mean()
+
+
+def test_bleeding_conserves_charge_and_stays_in_the_column():
+    rng = np.random.default_rng(4)
+    electrons = rng.uniform(0, 50, (80, 30)).astype(np.float32)
+    before = electrons.copy()
+    electrons[40, 7] = 1200
+    electrons[41, 7] = 900
+    electrons[60, 20] = 333
+    expected = electrons.sum(axis=0, dtype=float)
+    bleed(electrons, 100.0)
+    assert_allclose(electrons.sum(axis=0, dtype=float), expected, rtol=1e-6)
+    assert electrons.max() <= 100
+    still = np.ones(30, bool)
+    still[[7, 20]] = False
+    assert_array_equal(electrons[:, still], before[:, still])
+    full = np.flatnonzero(electrons[:, 7] == 100)
+    assert_array_equal(full, np.arange(full[0], full[-1] + 1))
+    assert abs(full.mean() - 40.5) <= 1.5
+
+
+def test_charge_that_reaches_the_end_of_a_column_is_lost():
+    electrons = np.full((10, 1), 90, np.float32)
+    electrons[5] = 1e4
+    bleed(electrons, 100.0)
+    assert_array_equal(electrons, 100)
+
+
+def test_a_saturated_star_bleeds_up_and_down():
+    scene = simulate(one_star(150, 100, 5e6), instrument=SMALL, rng=1,
+                     effects=DetectorEffects(bleeding=True))
+    rows, columns = np.nonzero(scene.mask)
+    assert np.ptp(rows) > 3 * np.ptp(columns)
+    assert scene.image.max() < SMALL.full_well + 50
+    light = (scene.image - scene.background).sum()
+    assert_allclose(light, 5e6, rtol=2e-3)
+
+
+def test_nonlinearity_takes_its_share_at_the_full_well():
+    star = one_star(150, 100, 4e5)
+    scenes = [simulate(star, instrument=SMALL, rng=1,
+                       effects=DetectorEffects(nonlinearity=loss))
+              for loss in (0, 0.05)]
+    charge = scenes[0].image[100, 150]
+    lost = 1 - scenes[1].image[100, 150] / charge
+    assert charge > 0.5 * SMALL.full_well
+    assert_allclose(lost, 0.05 * charge / SMALL.full_well, rtol=0.05)
+
+
+def test_charge_diffusion_widens_the_true_psf():
+    star = one_star(150, 100, 1e4)
+    plain = simulate(star, instrument=SMALL, rng=1)
+    wide = simulate(star, instrument=SMALL, rng=1,
+                    effects=DetectorEffects(charge_diffusion=0.5))
+    gain = (wide.psf.mixture_at(9, 9).moments().covariance
+            - plain.psf.mixture_at(9, 9).moments().covariance)
+    assert_allclose(gain, 0.25 * np.eye(2), atol=1e-12)
+    assert wide.image.max() < plain.image.max()
+
+
+def test_all_effects_together_do_not_depend_on_threads():
+    camera = Instrument(shape=(300, 200))
+    stars = crowded_field(camera.shape, rng=1)
+    with ThreadPoolExecutor(1) as pool:
+        one, many = (simulate(stars, instrument=camera, rng=7,
+                              effects=DetectorEffects.typical(), executor=e)
+                     for e in (pool, None))
+    assert_array_equal(one.image, many.image)
+    assert_array_equal(one.error, many.error)
+    assert_array_equal(one.flags, many.flags)
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    ('prnu', -0.1), ('hot_pixels', 2), ('cosmic_rays', -1),
+    ('bad_columns', -1)])
+def test_effects_of_nonsense_are_refused(name, value):
+    with pytest.raises(ValueError, match=f'{name} must be at'):
+        DetectorEffects(**{name: value})
+
+
+# Files.
+
+@pytest.fixture(scope='module')
+def small_scene():
+    sources = sky_field(20, 10, size=0.3, rng=1, magnitudes=(18, 22))
+    return simulate(sources, paper_exposures()[1], rng=2,
+                    instrument=Instrument(shape=(240, 250)),
+                    effects=DetectorEffects.typical())
+
+
+def test_a_scene_is_read_back_from_extensions(small_scene, tmp_path):
+    paths = small_scene.write(tmp_path / 'a.fits')
+    assert [p.name for p in paths] == ['a.fits', 'a_truth.ecsv', 'a_wcs.asdf']
+    with fits.open(paths[0]) as hdus:
+        assert_array_equal(hdus['SCI'].data, small_scene.image)
+        assert_array_equal(hdus['ERR'].data, small_scene.error)
+        assert_array_equal(hdus['DQ'].data, small_scene.flags)
+        header = hdus['SCI'].header
+    truth = QTable.read(paths[1])
+    assert_allclose(truth['x'].value, small_scene.truth['x'].value)
+    assert truth['pmra'].unit == u.mas / u.yr
+    x, y = truth['x'].value, truth['y'].value
+    ra, dec = small_scene.wcs(x, y, with_bounding_box=False)
+    with asdf.open(paths[2]) as file:
+        assert_allclose(file['wcs'](x, y, with_bounding_box=False),
+                        [ra, dec], rtol=0, atol=1e-13)
+    assert_allclose(FITSWCS(header).all_pix2world(x, y, 0), [ra, dec],
+                    rtol=0, atol=1e-3 / 3.6e6)
+
+
+def test_a_scene_is_read_back_from_the_csst_layout(small_scene, tmp_path):
+    paths = small_scene.write(tmp_path / 'b', layout='csst')
+    assert [p.name for p in paths[:3]] == ['b.fits', 'b_flg.fits',
+                                           'b_wht.fits']
+    image, flags, weight = (fits.getdata(p) for p in paths[:3])
+    assert_allclose(image * 150, small_scene.image, rtol=1e-6)
+    assert_array_equal(flags, small_scene.flags)
+    good = ~small_scene.mask
+    assert_allclose(weight[good]**-0.5 * 150, small_scene.error[good],
+                    rtol=1e-5)
+    assert not weight[~good].any()
+    assert fits.getheader(paths[0])['BUNIT'] == 'electron / s'
+
+
+def test_files_are_not_overwritten_unasked(small_scene, tmp_path):
+    small_scene.write(tmp_path / 'c')
+    with pytest.raises(FileExistsError, match='overwrite'):
+        small_scene.write(tmp_path / 'c')
+    small_scene.write(tmp_path / 'c', overwrite=True)
+    with pytest.raises(ValueError, match='layout must be one of'):
+        small_scene.write(tmp_path / 'd', layout='fits')
+
+
+# Catalogues at the bound.
+
+def test_errors_of_a_bound_catalogue_are_those_of_the_fisher_matrix():
+    psf = csst_psf((200, 200))
+    model = psf.copy()
+    y, x = np.mgrid[84:115, 84:115].astype(float)
+    value, by_x, by_y = model.fit_deriv(x, y, 3000.0, 99.7, 99.2)
+    inverse_variance = 1 / (50.0 + 3000 * value)
+    jacobian = np.stack([by_x, by_y, value]).reshape(3, -1)
+    fisher = (jacobian * inverse_variance.ravel()) @ jacobian.T
+    bound = covariances(psf, np.array([99.7]), np.array([99.2]),
+                        np.array([3000.0]), 50.0, None)[0]
+    assert_allclose(bound, np.linalg.inv(fisher), rtol=0.01, atol=1e-5)
+
+
+def test_catalogues_scatter_as_their_errors_say():
+    sources = sky_field(300, 0, size=2, rng=1, magnitudes=(19, 26))
+    camera = Instrument(shape=(1500, 1500))
+    catalogue, = simulate_catalogues(sources, [Exposure()], rng=2,
+                                     instrument=camera)
+    table, truth = catalogue.table, catalogue.truth
+    assert len(table) < 300
+    assert (table['flux_fit'] / table['flux_err']).min() > 2
+    for name in ('x', 'y', 'flux'):
+        pulls = ((table[f'{name}_fit'] - truth[name])
+                 / table[f'{name}_err']).value
+        assert abs(pulls.std() - 1) < 4 / np.sqrt(2 * len(pulls))
+        assert abs(pulls.mean()) < 4 / np.sqrt(len(pulls))
+    assert_array_equal(table['id'], truth['id'])
+
+
+def test_every_exposure_needs_its_psf():
+    with pytest.raises(ValueError, match='psfs must have one element'):
+        simulate_epochs(sky_field(1, 0, rng=1), paper_exposures()[:2],
+                        psfs=[None], rng=1)
