@@ -35,6 +35,10 @@ class _Read(registry.UnifiedReadWrite):
     ValueError
         If the file is damaged, was made by a newer version, or holds
         something else.
+
+    Notes
+    -----
+    Every number comes back bit by bit.
     """
 
     def __init__(self, instance, cls):
@@ -61,6 +65,10 @@ class _Write(registry.UnifiedReadWrite):
     ------
     OSError
         If the file exists and ``overwrite`` is not set.
+
+    Notes
+    -----
+    Every number is written as a float64 column, none as a header card.
     """
 
     def __init__(self, instance, cls):
