@@ -137,5 +137,5 @@ def test_positions_at_the_pole_have_errors_along_the_parallel():
     ([(np.zeros((9, 9)), PSF, None)], TypeError),
     ([(np.zeros((9, 9)), 'psf', make_wcs())], TypeError)])
 def test_wrong_images_are_refused(images, error):
-    with pytest.raises(error, match='images|wcs'):
+    with pytest.raises(error, match=r'images|wcs'):
         fit_many(images, SkyCoord([150], [40], unit='deg'))
