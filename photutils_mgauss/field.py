@@ -27,7 +27,7 @@ from photutils_mgauss._field_fit import (
     model_stamps,
     to_vector,
 )
-from photutils_mgauss._stamps import cut_stamps, remove_star_noise
+from photutils_mgauss._star_stamps import cut_stamps, remove_star_noise
 from photutils_mgauss._tables import as_image, read_sources
 from photutils_mgauss._validation import as_integer, as_real, as_shape
 from photutils_mgauss.gridded import GriddedMixturePSF

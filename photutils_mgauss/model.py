@@ -11,6 +11,7 @@ The weights of K Gaussians are held as K - 1 stick-breaking fractions
 import numpy as np
 
 from photutils_mgauss import _kernels
+from photutils_mgauss._files import storable
 from photutils_mgauss._psf_model import (
     PSFModel,
     PSFParameter,
@@ -34,6 +35,7 @@ _RHO_BOUNDS = (-0.9999, 0.9999)
 _FRACTION_BOUNDS = (0, 1)
 
 
+@storable
 class MultiGaussianPSFModel(PSFModel):
     r"""
     A PSF that is a sum of K correlated Gaussians.
@@ -215,14 +217,14 @@ class MultiGaussianPSFModel(PSFModel):
         `~numpy.ndarray`
             The model, in the unit of ``flux``.
         """
-        shape = _Shape(strip_units([x, *shape])[1:])
+        rows = _rows_of(strip_units([x, *shape])[1:])
         x, y, x_0, y_0 = strip_units([x, y, x_0, y_0])
         flux, unit = split_flux(flux)
         dx = np.subtract(x, x_0, dtype=float)
         dy = np.subtract(y, y_0, dtype=float)
         (dx, dy), lattice = flat_points(dx, dy)
         out = np.empty(dx.size)
-        _kernels.evaluate(dx, dy, shape.rows, self._pixel_integrated, out)
+        _kernels.evaluate(dx, dy, rows, self._pixel_integrated, out)
         return with_unit(flux * out.reshape(lattice), unit)
 
     def fit_deriv(self, x, y, flux, x_0, y_0, *shape):
@@ -247,20 +249,20 @@ class MultiGaussianPSFModel(PSFModel):
         dx = np.asarray(x, float) - np.squeeze(x_0)
         dy = np.asarray(y, float) - np.squeeze(y_0)
         (dx, dy), lattice = flat_points(dx, dy)
-        shape = _Shape(shape)
         if any(free[3:]):
-            columns = self._all_derivatives(dx, dy, flux, shape, free)
+            columns = self._all_derivatives(dx, dy, flux, _Shape(shape), free)
         else:
-            columns = self._position_derivatives(dx, dy, flux, shape)
+            columns = self._position_derivatives(dx, dy, flux,
+                                                 _rows_of(shape))
         zero = np.zeros(lattice)
         columns += [zero] * (len(free) - len(columns))
         return [column.reshape(lattice) if is_free else zero
                 for column, is_free in zip(columns, free, strict=True)]
 
-    def _position_derivatives(self, dx, dy, flux, shape):
+    def _position_derivatives(self, dx, dy, flux, rows):
         out = np.empty((3, dx.size))
-        _kernels.evaluate(dx, dy, shape.rows, self._pixel_integrated, out[0])
-        _kernels.gradient(dx, dy, shape.rows, self._pixel_integrated, out[1:])
+        _kernels.evaluate(dx, dy, rows, self._pixel_integrated, out[0])
+        _kernels.gradient(dx, dy, rows, self._pixel_integrated, out[1:])
         return [out[0], -flux * out[1], -flux * out[2]]
 
     def _all_derivatives(self, dx, dy, flux, shape, free):
@@ -274,6 +276,23 @@ class MultiGaussianPSFModel(PSFModel):
             columns += shape.derivatives(k, flux, jets[k]) if any(
                 free[first:first + 5]) else [value] * 5
         return columns
+
+    _columns = {'model': {'name': '', 'pixel_integrated': ''},
+                'parameters': PSFModel._parameter_columns}
+
+    def _to_tables(self):
+        return {'model': {'name': [str(self.name or '')],
+                          'pixel_integrated': [self._pixel_integrated]},
+                'parameters': self._parameter_table()}
+
+    @classmethod
+    def _from_tables(cls, tables):
+        model, parameters = tables['model'], tables['parameters']
+        keywords = cls._parameter_keywords(parameters)
+        # flux, x_0, y_0, K - 1 fractions and 5 K more.
+        return cls(n_components=(len(parameters['name']) - 2) // 6,
+                   pixel_integrated=model['pixel_integrated'][0],
+                   name=str(model['name'][0]) or None, **keywords)
 
     def _half_size(self):
         shape = _Shape(self._shape_parameters)
@@ -290,7 +309,7 @@ class _Shape:
     """The shape parameters of a model as arrays, valid whatever they are."""
 
     def __init__(self, parameters):
-        values = np.array([float(np.squeeze(p)) for p in parameters])
+        values = _numbers(parameters)
         n = (values.size + 1) // 6
         self.fractions = values[:n - 1]
         # Left of each break, the length of stick that remains.
@@ -310,13 +329,6 @@ class _Shape:
         q = sy**-2
         return np.column_stack([np.sqrt(p * q) / (2 * np.pi), self.means, p,
                                 self.rho * sx / sy, q])
-
-    @property
-    def rows(self):
-        """The kernels' rows, (K, 6)."""
-        rows = self.unit_rows
-        rows[:, 0] *= self.weights
-        return rows
 
     def weight_slopes(self):
         """Return d weight_j / d fraction_i, (K - 1, K)."""
@@ -343,6 +355,22 @@ class _Shape:
         sign_x, sign_y = np.sign(self.raw_stddevs[k])
         return [-gx, -gy, sign_x * (sx * gxx + rho * sy * gxy),
                 sign_y * (sy * gyy + rho * sx * gxy), sx * sy * gxy]
+
+
+def _numbers(parameters):
+    """Return scalar parameters, each a number or an array of one, flat."""
+    try:
+        return np.array(parameters, dtype=float).ravel()
+    except ValueError:  # numbers and arrays of one, mixed
+        return np.array([float(np.squeeze(p)) for p in parameters])
+
+
+def _rows_of(parameters):
+    """Return the kernels' rows (K, 6) of shape parameters."""
+    values = _numbers(parameters)
+    rows = np.empty(((values.size + 1) // 6, 6))
+    _kernels.model_rows(values, _MIN_STDDEV, _MAX_RHO, rows)
+    return rows
 
 
 def _default_mixture(n_components):

@@ -8,7 +8,7 @@ from photutils.detection import DAOStarFinder
 from photutils.utils.exceptions import NoDetectionsWarning
 from scipy.spatial import KDTree
 
-from photutils_mgauss._stamps import cut_stamps
+from photutils_mgauss._star_stamps import cut_stamps
 from photutils_mgauss._tables import as_image, read_sources
 from photutils_mgauss._validation import as_integer, as_real
 

@@ -14,7 +14,7 @@ from photutils_mgauss._field_fit import (
     equations,
     to_coefficients,
 )
-from photutils_mgauss._stamps import Stamps
+from photutils_mgauss._star_stamps import Stamps
 
 SHAPE = (200, 240)
 

@@ -1,0 +1,58 @@
+"""
+Sphinx configuration, on top of the one all astropy packages share.
+
+Warnings are errors in the build that checks the documentation, and it must
+pass without a network. So references are of two kinds: our own names, which
+have to resolve, and names of other packages, which resolve where their
+inventories can be read (``MGAUSS_INTERSPHINX=1``) and are plain text
+otherwise.
+"""
+import datetime as dt
+import os
+
+from sphinx_astropy.conf.v3 import *
+
+import photutils_mgauss
+
+project = 'photutils_mgauss'
+author = 'The photutils_mgauss developers'
+_year = dt.datetime.now(tz=dt.UTC).year
+project_copyright = f'{_year}, {author}'
+release = photutils_mgauss.__version__
+version = '.'.join(release.split('.')[:2])
+
+extensions.remove('sphinx.ext.todo')
+exclude_patterns = ['_build', '**.ipynb_checkpoints']
+html_title = f'{project} {release}'
+html_static_path = []
+html_theme_options = {}
+modindex_common_prefix = ['photutils_mgauss.']
+
+# Every name of ours must resolve, and is looked for in the package first.
+nitpicky = True
+rst_prolog = '.. currentmodule:: photutils_mgauss'
+numpydoc_xref_param_type = False
+automodsumm_inherited_members = False
+
+if os.environ.get('MGAUSS_INTERSPHINX') == '1':
+    intersphinx_mapping |= {
+        'photutils': ('https://photutils.readthedocs.io/en/stable/', None),
+        'gwcs': ('https://gwcs.readthedocs.io/en/latest/', None),
+    }
+else:
+    intersphinx_mapping = {}
+
+# Names of other packages and of the standard library, by their first word.
+_others = (
+    'numpy np scipy astropy photutils gwcs pymc arviz numba matplotlib asdf '
+    'concurrent collections enum functools pathlib typing')
+_plain = (
+    'bool bytes callable complex dict float frozenset int list object '
+    'property range set slice str tuple type None True False')
+nitpick_ignore_regex = [
+    # The base classes of public ones may be private.
+    ('py:.*', r'photutils_mgauss\._.*'),
+    ('py:.*', rf'({"|".join(_others.split())})(\..*)?'),
+    ('py:.*', '|'.join(_plain.split())),
+    ('py:.*', '[A-Z][A-Za-z]*(Error|Warning)'),
+]

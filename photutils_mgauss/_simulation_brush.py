@@ -1,0 +1,142 @@
+"""
+What draws stars: mixtures on a grid, or images of effective PSFs on one.
+
+A brush adds stars to an image whose first pixel is the detector's (left,
+bottom), and knows how far from a star it paints.
+"""
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from astropy.nddata import NDData
+from photutils.psf import GriddedPSFModel
+from scipy.ndimage import gaussian_filter, spline_filter
+
+from photutils_mgauss import _kernels
+from photutils_mgauss.gridded import GriddedMixturePSF
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureBrush:
+    """Stars made of Gaussians."""
+
+    psf: GriddedMixturePSF
+
+    @property
+    def peak(self):
+        """The brightest pixel of any star of flux 1."""
+        integrated = self.psf.pixel_integrated
+        return max(float(m.evaluate(0, 0, pixel_integrated=integrated))
+                   for m in self.psf.mixtures)
+
+    def reach(self, flux, faintest):
+        """Return how far a star of each flux is drawn (n,) [pix]."""
+        rows = self.psf._grid.rows
+        peak = np.abs(rows[..., 0]).max(axis=0)
+        stddev = 1 / np.sqrt(rows[..., 5].min(axis=0))
+        offset = np.abs(rows[..., 2]).max()
+        reach = np.zeros_like(flux)
+        for height, sigma in zip(peak, stddev, strict=True):
+            ratio = np.maximum(np.abs(flux) * height / faintest,
+                               1 / _kernels._DEPTH)
+            reach = np.maximum(reach, sigma * np.sqrt(2 * np.log(ratio)))
+        return reach + offset + 1
+
+    def add(self, stars, faintest, left, bottom, out):
+        """Add stars (3, n), the rows x, y and flux, to out (ny, nx)."""
+        x, y, flux = np.ascontiguousarray(stars)
+        grid = self.psf._grid
+        kernel, nodes = ((_kernels.render_image, grid.rows)
+                         if self.psf.interpolation == 'blend' else
+                         (_kernels.render_matched_image, grid.sums))
+        kernel(x, y, flux, nodes, grid.x_grid, grid.y_grid,
+               self.psf.pixel_integrated, float(faintest), float(left),
+               float(bottom), out)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageBrush:
+    """Stars interpolated in the ePSF images of a photutils grid."""
+
+    psf: GriddedPSFModel
+
+    @property
+    def peak(self):
+        """The brightest pixel of any star of flux 1."""
+        return float(np.max(self.psf.data))
+
+    @cached_property
+    def _table(self):
+        """Spline coefficients (M, ny, nx), ordered by y, then x, and axes."""
+        places = np.asarray(self.psf.grid_xypos, float)
+        order = np.lexsort((places[:, 0], places[:, 1]))
+        images = np.asarray(self.psf.data, float)[order]
+        coefficients = np.array([spline_filter(image, order=3, mode='mirror')
+                                 for image in images])
+        return coefficients, *(np.unique(axis) for axis in places.T)
+
+    @property
+    def _oversampling(self):
+        y, x = np.broadcast_to(self.psf.oversampling, 2)
+        if x != y:
+            msg = (f'psf must have the same oversampling along x and y, got '
+                   f'{int(x)} and {int(y)}')
+            raise ValueError(msg)
+        return int(x)
+
+    @property
+    def _half(self):
+        """The distance from the middle to the last whole pixel [pix]."""
+        ny, nx = self.psf.data.shape[1:]
+        return (min(ny, nx) - 1) / 2 / self._oversampling - 1
+
+    @cached_property
+    def _profile(self):
+        """The brightest sample beyond each whole distance, per flux."""
+        images = np.abs(np.asarray(self.psf.data, float)).max(axis=0)
+        y, x = (np.arange(n) - (n - 1) / 2 for n in images.shape)
+        distance = np.hypot(y[:, None], x) / self._oversampling
+        rings = [images[distance >= r].max() for r in
+                 range(int(self._half) + 1)]
+        return np.array(rings)
+
+    def reach(self, flux, faintest):
+        """Return how far a star of each flux is drawn (n,) [pix]."""
+        # The profile falls; find the first distance it is too faint at. The
+        # rings of bright stars end with the table.
+        level = np.maximum(faintest / np.maximum(np.abs(flux), 1e-300),
+                           _kernels._DEPTH * self._profile[0] * 0.1)
+        steps = np.searchsorted(-self._profile, -level)
+        return np.minimum(steps + 1, int(self._half)).astype(float)
+
+    def add(self, stars, faintest, left, bottom, out):
+        """Add stars (3, n), the rows x, y and flux, to out (ny, nx)."""
+        x, y, flux = np.ascontiguousarray(stars)
+        table, x_grid, y_grid = self._table
+        _kernels.render_epsfs(x, y, flux, self.reach(flux, faintest), table,
+                              x_grid, y_grid, float(self._oversampling),
+                              float(left), float(bottom), out)
+
+
+def brush_of(psf):
+    """Return what draws stars with a PSF."""
+    if isinstance(psf, GriddedMixturePSF):
+        return MixtureBrush(psf)
+    if isinstance(psf, GriddedPSFModel):
+        return ImageBrush(psf)
+    msg = ('psf must be a GriddedMixturePSF or a GriddedPSFModel, got '
+           f'{type(psf).__name__}')
+    raise TypeError(msg)
+
+
+def widen(psf, stddev):
+    """Return a PSF convolved with a round Gaussian [pix]."""
+    if stddev == 0:
+        return psf
+    if isinstance(psf, GriddedMixturePSF):
+        return psf.convolve(stddev**2 * np.eye(2))
+    sigma = stddev * np.broadcast_to(psf.oversampling, 2)
+    images = [gaussian_filter(np.asarray(image, float), sigma,
+                              mode='constant') for image in psf.data]
+    return GriddedPSFModel(NDData(np.array(images), meta={
+        'grid_xypos': psf.grid_xypos, 'oversampling': psf.oversampling}))

@@ -1,0 +1,166 @@
+"""
+From stars to pixels: light, charge and readout, in bands of rows.
+
+Each band has random numbers of its own, so that a seed gives the same pixels
+with any number of threads.
+"""
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from photutils_mgauss._brighter_fatter import shoot_stars
+from photutils_mgauss._detector_effects import (
+    SATURATED,
+    DetectorEffects,
+    add_cosmic_rays,
+    bleed,
+    pattern,
+    respond,
+)
+from photutils_mgauss._parallel import available_cores
+from photutils_mgauss._simulation_brush import brush_of
+from photutils_mgauss._simulation_instrument import Instrument
+from photutils_mgauss._simulation_sky import Exposure
+
+# Rows that share a random stream. It is part of what a seed means.
+_BAND_ROWS = 128
+
+# Gaussians are drawn where they exceed this [electron]: a thousandth of the
+# noise of the faintest pixel.
+FAINTEST = 1e-3
+
+
+def draw(psf, x, y, flux, shape, faintest, executor):
+    """Return the light (ny, nx) of stars."""
+    bands, brush = row_bands(shape), brush_of(psf)
+    image = np.empty(shape)
+    parts = _run(partial(_render, brush, shape[1], faintest), executor, bands,
+                 _split(brush, x, y, flux, bands, faintest))
+    for band, part in zip(bands, parts, strict=True):
+        image[band] = part
+    return image
+
+
+def row_bands(shape):
+    """Return slices of the rows of an image."""
+    ny = shape[0]
+    return [slice(start, min(start + _BAND_ROWS, ny))
+            for start in range(0, ny, _BAND_ROWS)]
+
+
+def _run(function, executor, *columns):
+    """Map a function over columns of arguments, in threads by default."""
+    if executor is not None:
+        yield from executor.map(function, *columns)
+        return
+    with ThreadPoolExecutor(available_cores()) as pool:
+        yield from pool.map(function, *columns)
+
+
+def _split(brush, x, y, flux, bands, faintest):
+    """Yield, for each band, the stars (3, n) that may reach it."""
+    # By y, so that each band finds its stars, and the sum over stars in
+    # each pixel has one order.
+    order = np.argsort(y, kind='stable')
+    stars = np.stack([x, y, flux])[:, order]
+    reach = brush.reach(stars[2], faintest)
+    farthest = reach.max(initial=0)
+    for band in bands:
+        first, last = np.searchsorted(
+            stars[1], [band.start - farthest, band.stop + farthest])
+        near = slice(first, last)
+        distance = np.maximum(band.start - stars[1, near],
+                              stars[1, near] - band.stop)
+        yield stars[:, near][:, distance <= reach[near]]
+
+
+def _render(brush, width, faintest, band, stars):
+    """Return the expected light (rows, width) of stars in a band of rows."""
+    out = np.zeros((band.stop - band.start, width))
+    brush.add(stars, faintest, 0, band.start, out)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Chip:
+    """A detector during an exposure."""
+
+    instrument: Instrument
+    effects: DetectorEffects
+    exposure: Exposure
+
+    @property
+    def bands(self):
+        """The bands of rows it is made in."""
+        return row_bands(self.instrument.shape)
+
+    @property
+    def sky(self):
+        """The light of the sky in a pixel [electron]."""
+        return self.instrument.sky(self.exposure.band)
+
+    def pattern(self, band):
+        """Return what is fixed about a band of rows."""
+        return pattern(self.effects, self.exposure.detector, band,
+                       self.instrument.shape[1])
+
+
+def expose(chip, truth, psf, rng, executor):
+    """Return the electrons in each pixel, at most a full well, and flags."""
+    x, y, flux = (truth[name].value for name in ('x', 'y', 'flux'))
+    brush = brush_of(psf)
+    electrons = np.empty(chip.instrument.shape, np.float32)
+    flags = np.empty(chip.instrument.shape, np.uint8)
+    repel = chip.effects.brighter_fatter
+    stars = _split(brush, x, y, 0 * flux if repel else flux, chip.bands,
+                   FAINTEST)
+    parts = _run(partial(_expose_band, chip, brush), executor, chip.bands,
+                 stars, rng.spawn(len(chip.bands)))
+    for band, part in zip(chip.bands, parts, strict=True):
+        electrons[band], flags[band] = part
+    if repel:
+        electrons += shoot_stars(psf, x, y, flux, chip.instrument.shape,
+                                 repel, rng)
+    add_cosmic_rays(electrons, flags, chip.effects,
+                    chip.instrument.exposure_time, rng)
+    full_well = chip.instrument.full_well
+    if chip.effects.bleeding:
+        bleed(electrons, full_well)
+    flags |= np.where(electrons >= full_well, SATURATED, 0).astype(np.uint8)
+    np.minimum(electrons, np.float32(full_well), out=electrons)
+    return electrons, flags
+
+
+def _expose_band(chip, brush, band, stars, rng):
+    """Return the electrons and flags of a band of rows."""
+    instrument, fixed = chip.instrument, chip.pattern(band)
+    expected = _render(brush, instrument.shape[1], FAINTEST, band, stars)
+    expected += chip.sky
+    expected *= fixed.response
+    expected += instrument.dark_level
+    expected += fixed.dark * instrument.exposure_time
+    return rng.poisson(expected).astype(np.float32), fixed.flags
+
+
+def read(chip, electrons, rng, executor):
+    """Return the image that a pipeline makes of the electrons, and error."""
+    image = np.empty(electrons.shape, np.float32)
+    error = np.empty(electrons.shape, np.float32)
+    parts = _run(partial(_read_band, chip), executor, chip.bands,
+                 (electrons[band] for band in chip.bands),
+                 rng.spawn(len(chip.bands)))
+    for band, part in zip(chip.bands, parts, strict=True):
+        image[band], error[band] = part
+    return image, error
+
+
+def _read_band(chip, band, electrons, rng):
+    instrument, flat = chip.instrument, chip.pattern(band).flat
+    charge = respond(electrons, chip.effects, instrument.full_well)
+    noise = instrument.read_noise * rng.standard_normal(charge.shape)
+    counts = np.rint((charge + noise + instrument.bias) / instrument.gain)
+    level = counts * instrument.gain - instrument.bias
+    variance = np.maximum(level, 0) + instrument.readout_variance
+    return (level - instrument.dark_level) / flat, np.sqrt(variance) / flat

@@ -1,0 +1,197 @@
+"""
+A PSF field from the optics of a telescope, through GalSim where installed.
+
+The star is imaged by a clear circular pupil, at several wavelengths of the
+band, with aberrations that are cubic polynomials of the position; the jitter
+of the telescope and the diffusion of charge in the detector widen it.
+"""
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from astropy.nddata import NDData
+from numpy.polynomial import polynomial
+from photutils.psf import GriddedPSFModel
+
+from photutils_mgauss._simulation_instrument import Band
+from photutils_mgauss._simulation_psf import band_of
+from photutils_mgauss._validation import as_integer, as_real, as_shape
+
+# Noll's numbers of the aberrations: defocus, astigmatism, coma, trefoil and
+# spherical, and how strong each is in comparison.
+_NOLL = np.arange(4, 12)
+_STRENGTH = np.array([1, 1, 1, 0.8, 0.8, 0.5, 0.5, 0.5])
+
+
+@dataclass(frozen=True, eq=False)
+class Optics:
+    """
+    A telescope as GalSim draws it: PSFs at any place of a detector.
+
+    Parameters
+    ----------
+    shape : int or (ny, nx) tuple of int
+        The pixels of the detector.
+    band : str or Band, optional
+        The filter.
+    wavefront : float, optional
+        Root mean square of the constant part of an aberration [nm].
+    variation : float, optional
+        The same of the coefficients of its change, up to the corners [nm].
+    jitter : float, optional
+        Standard deviation of the telescope's motion [arcsec].
+    diffusion : float, optional
+        Standard deviation of the diffusion of charge [arcsec].
+    n_wavelengths : int, optional
+        How many wavelengths stand for the band.
+    pixel_scale : float, optional
+        The side of a pixel [arcsec].
+    rng : int or `~numpy.random.Generator`, optional
+        The seed of the aberrations.
+
+    Raises
+    ------
+    ImportError
+        If galsim is not installed.
+    ValueError
+        If a value is out of range.
+    """
+
+    shape: tuple
+    band: Band = 'g'
+    wavefront: float = field(default=24.0, kw_only=True)
+    variation: float = field(default=12.0, kw_only=True)
+    jitter: float = field(default=0.030, kw_only=True)
+    diffusion: float = field(default=0.026, kw_only=True)
+    n_wavelengths: int = field(default=4, kw_only=True)
+    pixel_scale: float = field(default=0.074, kw_only=True)
+    rng: int = field(default=24, kw_only=True)
+
+    def __post_init__(self):
+        _galsim()
+        object.__setattr__(self, 'shape', as_shape(self.shape, 'shape'))
+        object.__setattr__(self, 'band', band_of(self.band))
+        for name in ('wavefront', 'variation'):
+            as_real(getattr(self, name), name, minimum=0)
+        for name in ('jitter', 'diffusion', 'pixel_scale'):
+            as_real(getattr(self, name), name, above=0)
+        as_integer(self.n_wavelengths, 'n_wavelengths', minimum=1)
+        _ = self._coefficients
+
+    @cached_property
+    def _coefficients(self):
+        """The polynomials of the aberrations, (8, 4, 4) [nm]."""
+        rng = np.random.default_rng(self.rng)
+        order = np.add(*np.indices((4, 4)))
+        size = np.where(order == 0, self.wavefront,
+                        self.variation / np.maximum(order, 1))
+        size = np.where(order <= 3, size, 0)
+        return (rng.standard_normal((8, 4, 4)) * size
+                * _STRENGTH[:, None, None])
+
+    def aberrations(self, x, y):
+        """
+        Return the aberrations at a place of the detector.
+
+        Parameters
+        ----------
+        x, y : float
+            The place [pix].
+
+        Returns
+        -------
+        (12,) `~numpy.ndarray`
+            Zernike coefficients in Noll's order, the first unused [nm].
+        """
+        ny, nx = self.shape
+        u, v = 2 * x / max(nx - 1, 1) - 1, 2 * y / max(ny - 1, 1) - 1
+        result = np.zeros(12)
+        result[_NOLL] = [polynomial.polyval2d(u, v, c)
+                         for c in self._coefficients]
+        return result
+
+    def profile(self, x, y):
+        """
+        Return the star at a place, before pixels.
+
+        Parameters
+        ----------
+        x, y : float
+            The place [pix].
+
+        Returns
+        -------
+        ``galsim.GSObject``
+            Of unit flux, in arcseconds.
+        """
+        galsim = _galsim()
+        params = galsim.GSParams(maximum_fft_size=8192,
+                                 folding_threshold=2.5e-3)
+        error = self.aberrations(x, y)
+        blue, red = self.band.wavelengths
+        middles = (np.arange(self.n_wavelengths) + 0.5) / self.n_wavelengths
+        colours = [galsim.OpticalPSF(
+            lam=wavelength, diam=self.band.diameter,
+            aberrations=list(error / wavelength), oversampling=1.5,
+            pad_factor=1.5, gsparams=params)
+            for wavelength in blue + (red - blue) * middles]
+        light = galsim.Sum(colours) / len(colours)
+        width = float(np.hypot(self.jitter, self.diffusion))
+        return galsim.Convolve([light, galsim.Gaussian(sigma=width)],
+                               gsparams=params)
+
+    def to_gridded_psf(self, n_nodes=9, *, oversampling=4, radius=32):
+        """
+        Tabulate the PSF, pixels included.
+
+        Parameters
+        ----------
+        n_nodes : int, optional
+            The number of nodes along each axis. Between them the PSF is the
+            blend of four.
+        oversampling : int, optional
+            Samples per pixel.
+        radius : int, optional
+            Half the side of the stamps [pix].
+
+        Returns
+        -------
+        `~photutils.psf.GriddedPSFModel`
+            To be given to `simulate`.
+
+        Raises
+        ------
+        ValueError
+            If a number is too small.
+        """
+        n_nodes = as_integer(n_nodes, 'n_nodes', minimum=2)
+        oversampling = as_integer(oversampling, 'oversampling', minimum=2)
+        radius = as_integer(radius, 'radius', minimum=4)
+        ny, nx = self.shape
+        nodes = [(float(x), float(y))
+                 for y in np.linspace(0, ny - 1, n_nodes)
+                 for x in np.linspace(0, nx - 1, n_nodes)]
+        images = [self._sample(x, y, oversampling, radius) for x, y in nodes]
+        return GriddedPSFModel(NDData(np.array(images), meta={
+            'grid_xypos': nodes, 'oversampling': oversampling}))
+
+    def _sample(self, x, y, oversampling, radius):
+        """Return the effective PSF at a place, its sum oversampling^2."""
+        galsim = _galsim()
+        n = 2 * radius * oversampling + 1
+        star = galsim.Convolve([self.profile(x, y),
+                                galsim.Pixel(self.pixel_scale)])
+        image = star.drawImage(nx=n, ny=n, method='no_pixel',
+                               scale=self.pixel_scale / oversampling,
+                               dtype=float)
+        return image.array * oversampling**2
+
+
+def _galsim():
+    try:
+        import galsim
+    except ImportError as error:
+        msg = ('Optics needs the package galsim (pip install galsim); '
+               'csst_psf makes a PSF field without it')
+        raise ImportError(msg) from error
+    return galsim

@@ -1,0 +1,228 @@
+"""Mixtures on a grid: the blend, its derivatives, its nodes and edges."""
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from astropy import units as u
+from hypothesis import given, settings
+from numpy.testing import assert_allclose, assert_array_equal
+from strategies import SETTINGS, numbers
+
+from photutils_mgauss import GaussianMixture, GriddedMixturePSF, blend
+
+Y, X = np.mgrid[:15, :15]
+
+
+def some_mixture(rng, k=3):
+    """Return a random mixture of k Gaussians."""
+    return GaussianMixture.from_stddevs(
+        rng.dirichlet(np.ones(k)), rng.normal(0, 0.2, (k, 2)),
+        rng.uniform(0.8, 3, (k, 2)), rng.uniform(-0.5, 0.5, k))
+
+
+def make_grid(x_grid=(0, 30, 100), y_grid=(0, 50), *, seed=3, shuffle=False,
+              **kwargs):
+    """Return a grid of random mixtures of 2 or 3 Gaussians."""
+    rng = np.random.default_rng(seed)
+    positions = [(x, y) for y in y_grid for x in x_grid]
+    mixtures = [some_mixture(rng, 2 + i % 2) for i in range(len(positions))]
+    if shuffle:
+        order = rng.permutation(len(positions))
+        positions = [positions[i] for i in order]
+        mixtures = [mixtures[i] for i in order]
+    return GriddedMixturePSF(mixtures, positions, **kwargs)
+
+
+def reference_blend(psf, x_0, y_0):
+    """Blend by hand: the four nodes around a place inside the grid."""
+    x_grid, y_grid = (np.unique(psf.grid_xypos[:, i]) for i in range(2))
+    i = min(max(np.searchsorted(x_grid, x_0) - 1, 0), len(x_grid) - 2)
+    j = min(max(np.searchsorted(y_grid, y_0) - 1, 0), len(y_grid) - 2)
+    fx = np.clip((x_0 - x_grid[i]) / (x_grid[i + 1] - x_grid[i]), 0, 1)
+    fy = np.clip((y_0 - y_grid[j]) / (y_grid[j + 1] - y_grid[j]), 0, 1)
+    n = len(x_grid)
+    nodes = [psf.mixtures[k] for k in (j * n + i, j * n + i + 1,
+                                       j * n + n + i, j * n + n + i + 1)]
+    return blend(nodes, [(1 - fx) * (1 - fy), fx * (1 - fy),
+                         (1 - fx) * fy, fx * fy])
+
+
+positions = {'x_0': numbers(-20, 130), 'y_0': numbers(-20, 70)}
+
+
+@given(**positions)
+@settings(**SETTINGS)
+def test_the_psf_is_the_blend_of_four_neighbours(x_0, y_0):
+    psf = make_grid()
+    expected = reference_blend(psf, x_0, y_0)
+    x, y = X + x_0 - 7, Y + y_0 - 7
+    assert_allclose(psf.evaluate(x, y, 5, x_0, y_0),
+                    5 * expected.evaluate(x - x_0, y - y_0), rtol=1e-12)
+    assert_allclose(psf.mixture_at(x_0, y_0).evaluate(X - 7, Y - 7),
+                    expected.evaluate(X - 7, Y - 7), rtol=1e-12)
+
+
+@given(**positions)
+@settings(**SETTINGS)
+def test_derivatives_include_the_change_of_the_blend(x_0, y_0):
+    psf = make_grid()
+    h = 1e-4
+    on_node = min(np.abs(psf.grid_xypos - (x_0, y_0)).min(axis=0))
+    if on_node < 2 * h:
+        return
+    x, y = X + np.rint(x_0) - 7, Y + np.rint(y_0) - 7
+    by_flux, by_x, by_y = psf.fit_deriv(x, y, 50, x_0, y_0)
+    assert_allclose(by_flux, psf.evaluate(x, y, 1, x_0, y_0), rtol=1e-12)
+    for column, dx, dy in ((by_x, h, 0), (by_y, 0, h)):
+        expected = (psf.evaluate(x, y, 50, x_0 + dx, y_0 + dy)
+                    - psf.evaluate(x, y, 50, x_0 - dx, y_0 - dy)) / (2 * h)
+        assert_allclose(column, expected, atol=1e-7 * np.abs(expected).max())
+
+
+def test_the_blend_matters_for_the_derivative():
+    # Without the change of the blend the derivative would be this wrong.
+    psf = make_grid((0, 5), (0, 5))
+    _, by_x, _ = psf.fit_deriv(X, Y, 1, 2.5, 2.5)
+    frozen = -psf.mixture_at(2.5, 2.5).gradient(X - 2.5, Y - 2.5)[..., 0]
+    assert np.abs(by_x - frozen).max() > 0.05 * np.abs(frozen).max()
+
+
+@given(y_0=numbers(-20, 70))
+@settings(**SETTINGS)
+def test_the_psf_is_continuous_across_nodes_and_edges(y_0):
+    psf = make_grid()
+    for edge in (0, 30, 100):
+        left = psf.mixture_at(edge - 1e-9, y_0).evaluate(X - 7, Y - 7)
+        right = psf.mixture_at(edge + 1e-9, y_0).evaluate(X - 7, Y - 7)
+        assert_allclose(left, right, rtol=0, atol=1e-9 * left.max())
+
+
+def test_outside_the_grid_the_edge_is_used_and_does_not_change():
+    psf = make_grid()
+    _, by_x, _ = psf.fit_deriv(X, Y, 1, -40, 25)
+    gradient = psf.mixture_at(0, 25).gradient(X + 40, Y - 25)
+    assert_allclose(by_x, -gradient[..., 0], atol=1e-300)
+    assert_allclose(psf.mixture_at(500, 500).covariances,
+                    psf.mixtures[-1].covariances)
+
+
+def test_nodes_are_ordered_by_y_then_x_whatever_order_they_come_in():
+    plain, shuffled = make_grid(), make_grid(shuffle=True)
+    assert_array_equal(plain.grid_xypos, [(0, 0), (30, 0), (100, 0), (0, 50),
+                                          (30, 50), (100, 50)])
+    assert_array_equal(shuffled.grid_xypos, plain.grid_xypos)
+    assert_array_equal(shuffled(X, Y), plain(X, Y))
+    assert plain.grid_shape == (2, 3)
+
+
+@pytest.mark.parametrize(('x_grid', 'y_grid'), [
+    ((5,), (7,)), ((0, 9), (7,)), ((5,), (0, 3, 11)), ((1, 2), (1, 2))])
+def test_small_grids_are_grids(x_grid, y_grid):
+    psf = make_grid(x_grid, y_grid)
+    assert psf.grid_shape == (len(y_grid), len(x_grid))
+    for node, (x, y) in zip(psf.mixtures, psf.grid_xypos, strict=True):
+        assert_allclose(psf.mixture_at(x, y).evaluate(X - 7, Y - 7),
+                        node.evaluate(X - 7, Y - 7), rtol=1e-12)
+    assert all(np.isfinite(column).all()
+               for column in psf.fit_deriv(X, Y, 1, 2.2, 3.3))
+
+
+def test_scales_multiply_the_flux_and_blend_with_the_images():
+    mixture = some_mixture(np.random.default_rng(1))
+    psf = GriddedMixturePSF([mixture] * 4, [(0, 0), (8, 0), (0, 8), (8, 8)],
+                            scales=[1, 1.2, 1, 1.2])
+    assert_allclose(psf.scale_at(2, 5), 1.05)
+    assert_allclose(psf.evaluate(X, Y, 3, 2, 5),
+                    3.15 * mixture.evaluate(X - 2, Y - 5))
+    assert_allclose(psf.mixture_at(2, 5).weights.sum(), 1)
+    local = psf.local_model(2, 5)
+    assert_allclose(local(X, Y), psf.evaluate(X, Y, 1, 2, 5))
+
+
+@pytest.mark.parametrize('integrated', [False, True])
+def test_many_stars_are_drawn_in_one_call(rng, integrated):
+    psf = make_grid(pixel_integrated=integrated)
+    x, y = rng.uniform(-5, 120, 20), rng.uniform(-5, 60, 20)
+    flux = rng.uniform(1, 100, 20)
+    stamps = psf.render(x, y, flux, (9, 12))
+    assert stamps.shape == (20, 9, 12)
+    dy, dx = np.mgrid[-4:5, -5:7]
+    for i in range(20):
+        assert_allclose(stamps[i], psf.evaluate(
+            dx + np.rint(x[i]), dy + np.rint(y[i]), flux[i], x[i], y[i]),
+            rtol=1e-9, atol=1e-12 * flux[i])
+
+
+def test_one_call_evaluates_one_star_per_pixel(rng):
+    psf = make_grid()
+    x_0, y_0 = rng.uniform(0, 100, 6), rng.uniform(0, 50, 6)
+    values = psf.evaluate(x_0 + 0.3, y_0 - 0.2, np.arange(6.0), x_0, y_0)
+    expected = [i * psf.mixture_at(x_0[i], y_0[i]).evaluate(0.3, -0.2)
+                for i in range(6)]
+    assert_allclose(values, expected)
+
+
+def test_to_gridded_psf_is_the_same_psf_in_photutils_words():
+    psf = make_grid((0, 30, 60, 100), (0, 20, 40, 60), flux=10)
+    peer = psf.to_gridded_psf(4, radius=9)
+    assert_allclose(peer.data[0].sum() / 16, 1, rtol=1e-2)
+    for x_0, y_0 in ((3.3, 4.4), (45.1, 31.7), (90, 60)):
+        x, y = X + np.rint(x_0) - 7, Y + np.rint(y_0) - 7
+        ours = psf.evaluate(x, y, 10, x_0, y_0)
+        assert_allclose(peer.evaluate(x, y, 10, x_0, y_0), ours,
+                        atol=5e-4 * ours.max())
+
+
+def test_convolve_convolves_every_node():
+    psf = make_grid(flux=2)
+    wide = psf.convolve([[1, 0.2], [0.2, 0.5]])
+    for narrow, node in zip(psf.mixtures, wide.mixtures, strict=True):
+        assert_allclose(node.covariances - narrow.covariances,
+                        np.broadcast_to([[1, 0.2], [0.2, 0.5]],
+                                        node.covariances.shape))
+
+
+@pytest.mark.parametrize('duplicate', [
+    copy.copy, copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m)),
+    GriddedMixturePSF.copy])
+def test_duplicates_are_the_same_psf(duplicate):
+    psf = make_grid(flux=3, x_0=1, name='star', meta={'a': [1]})
+    twin = duplicate(psf)
+    twin.flux = 5
+    assert psf.flux == 3
+    twin.flux = 3
+    assert repr(twin) == repr(psf)
+    assert twin.name == 'star'
+    assert twin.meta == psf.meta
+    assert_array_equal(twin(X, Y), psf(X, Y))
+    for array in twin._grid.arrays:
+        assert not array.flags.writeable
+
+
+def test_flux_may_be_a_quantity():
+    psf = make_grid(flux=3 * u.nJy)
+    assert psf(X, Y).unit == u.nJy
+    assert_allclose(psf(X, Y).value, 3 * make_grid()(X, Y))
+
+
+@pytest.mark.parametrize(('places', 'message'), [
+    ([(0, 0), (1, 0), (0, 1), (2, 2)], 'must form a rectangular grid, got 4'),
+    ([(0, 0), (0, 0), (0, 1), (1, 1)], r'two nodes at one place, got \[0\.0'),
+    ([(0, 0), (1, 0), (0, 1)], r'must have shape \(4, 2\), got \(3, 2\)'),
+    ([(0, 0), (1, 0), (0, 1), (1, np.nan)], 'grid_xypos must be finite'),
+])
+def test_bad_positions_are_named(places, message):
+    mixtures = [some_mixture(np.random.default_rng(1))] * 4
+    with pytest.raises(ValueError, match=message):
+        GriddedMixturePSF(mixtures, places)
+
+
+def test_bad_mixtures_and_scales_are_named():
+    mixture = some_mixture(np.random.default_rng(1))
+    with pytest.raises(TypeError, match='mixtures must be GaussianMixture'):
+        GriddedMixturePSF([mixture, 3], [(0, 0), (1, 0)])
+    with pytest.raises(ValueError, match='at least one element'):
+        GriddedMixturePSF([], np.empty((0, 2)))
+    with pytest.raises(ValueError, match='scales must be positive and finite, got -1'):
+        GriddedMixturePSF([mixture], [(0, 0)], scales=[-1])
