@@ -854,6 +854,31 @@ def render_matched_image(x, y, flux, sums, x_grid, y_grid, integrated,
                   faintest, scratch, out)
 
 
+# Least-squares fits of a mixture to a stamp. Everything is in stamp pixels
+# about a centre near the middle of the stamp. A Gaussian of flux f is a row of
+# five shape numbers, x, y, log l, t, log m, the mean and the Cholesky factor
+# of the precision matrix:
+#
+#     g = f l m / (2 pi) exp(-(a^2 + b^2) / 2),  a = l u + t v,  b = m v,
+#
+# with (u, v) the offset from the mean. Every parameter vector is a Gaussian.
+# All derivatives are g times a polynomial of degree 2 in x and y, so the
+# normal matrix follows from the moments up to degree 4 of the products of two
+# Gaussians: 5 sums a pixel and pair where the Jacobian would need 21 and more.
+#
+# The fluxes are linear. They are solved for exactly at every step, and the
+# shapes move along the Jacobian projected off them (variable projection in
+# Kaufman's form); the joint normal matrix with undamped fluxes does both.
+
+_LOG_2PI = float(np.log(2 * np.pi))
+
+# Rows of `limits`, see `penalty`.
+_NARROW, _WIDE, _REACH_X, _REACH_Y, _STIFFNESS = range(5)
+
+# What fit_stamp returns.
+FIT_CONVERGED, FIT_STOPPED = range(2)
+
+
 @_jit
 def draw_unit(shapes, cx, cy, images):
     """Put Gaussians of unit flux into images (K, ny, nx)."""
@@ -2672,7 +2697,7 @@ def solve(augmented, step):
 
 
 @_jit
-def _move(sources, n_sources, sky, fit_sky, step):
+def _shift_sources(sources, n_sources, sky, fit_sky, step):
     """Add the step to a stamp's own numbers; return the sky."""
     for j in range(n_sources):
         for i in range(2):
@@ -2723,8 +2748,8 @@ def field_normal(stamps, weights, corners, basis, coefficients, sources,
                              hold[star], size, normal)
             _eliminate(normal, own, size)
             _back_substitute(normal, own, size, step)
-            sky[star] = _move(sources[star], n_sources[star], sky[star],
-                              fit_sky, step)
+            sky[star] = _shift_sources(sources[star], n_sources[star],
+                                       sky[star], fit_sky, step)
         chi2[star] = normal[size - 1, size - 1]
         if used[star]:
             _spread(normal, own, size, basis[star], spread, total, gradient)
