@@ -2741,7 +2741,7 @@ def solve(augmented, step):
 
 
 @_jit
-def _move_sources(sources, n_sources, sky, fit_sky, step):
+def _shift_sources(sources, n_sources, sky, fit_sky, step):
     """Add the step to a stamp's own numbers; return the sky."""
     for j in range(n_sources):
         for i in range(2):
@@ -2792,8 +2792,8 @@ def field_normal(stamps, weights, corners, basis, coefficients, sources,
                              hold[star], size, normal)
             _eliminate(normal, own, size)
             _back_substitute(normal, own, size, step)
-            sky[star] = _move_sources(sources[star], n_sources[star],
-                                      sky[star], fit_sky, step)
+            sky[star] = _shift_sources(sources[star], n_sources[star],
+                                       sky[star], fit_sky, step)
         chi2[star] = normal[size - 1, size - 1]
         if used[star]:
             _spread(normal, own, size, basis[star], spread, total, gradient)
