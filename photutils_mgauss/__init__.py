@@ -23,6 +23,8 @@ except ImportError:  # a source tree that was never installed
 # Public name -> the module that owns it.
 _OWNERS = {
     'GriddedMixturePSF': 'gridded',
+    'PSFAssessment': 'assessment',
+    'assess_psf': 'assessment',
     'MixtureField': 'field',
     'fit_mixture_field': 'field',
     'select_psf_stars': 'selection',
@@ -62,6 +64,13 @@ _OWNERS = {
     'Shapes': 'shapes',
     'ShapeStatus': 'shapes',
     'fit_mixture': 'fitting',
+    'CramerRao': 'noise',
+    'cramer_rao': 'noise',
+    'pixel_error': 'noise',
+    'add_sky_positions': 'sky_photometry',
+    'fit_many': 'sky_photometry',
+    'PixelPhaseError': 'pixel_phase',
+    'pixel_phase_error': 'pixel_phase',
     'MixturePosterior': 'sampling',
     'sample_mixture': 'sampling',
     'select_n_components': 'comparison',

@@ -24,10 +24,12 @@ import numpy as np
 from photutils_mgauss import _kernels
 
 # Standard deviations of the prior on log weight, x, y (of the PSF's width),
-# log_p, s, log_q: of a polynomial's constant, and of its other terms. Real
-# PSFs vary less; the prior holds what the stars say nothing about.
-_PRIOR_CONSTANT = np.array([2.0, 1.0, 1.0, 0.7, 0.7, 0.7])
-_PRIOR_VARIATION = np.array([0.7, 0.4, 0.4, 0.3, 0.3, 0.3])
+# log_p, s, log_q: of a polynomial's constant, and of its other terms. A good
+# star overrules them by far; they decide what the stars say nothing about,
+# as which of two equal Gaussians is which. A weaker prior lets the wings
+# wander, and with them the centroid.
+_PRIOR_CONSTANT = np.array([0.8, 0.4, 0.4, 0.3, 0.3, 0.3])
+_PRIOR_VARIATION = np.array([0.15, 0.1, 0.1, 0.07, 0.07, 0.07])
 
 # Gauss-Newton steps of the stamps' own numbers for each step of the shapes.
 _SETTLE_STEPS = 2

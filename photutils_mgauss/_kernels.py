@@ -2504,6 +2504,50 @@ def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
         outcome[stars, 1] = evaluations
 
 
+@_jit
+def star_jet(x_0, y_0, box, psf, out):
+    """Put the unit-flux PSF in a box, d/dx_0 and d/dy_0 into out (3, n)."""
+    tiling = (np.empty(4 * _LANES), np.empty(3 * _LANES * box[3]),
+              np.empty(4, np.int64), np.empty((3, 4)))
+    _fill_jet(x_0, y_0, box, psf, tiling, out)
+
+
+@_jit
+def star_equations(image, error, mask, boxes, parameters, psf, chi2, n_pixels,
+                   matrices, gradients):
+    """
+    Evaluate stars, each by itself: chi2 (n,), (n, 3, 3) and (n, 3).
+
+    parameters (n, 3) are flux, x and y. Stars without pixels contribute
+    nothing; n_pixels (n,) is -1 where an error is not positive and finite.
+    """
+    area = max(1, np.max(boxes[:, 2] * boxes[:, 3]))
+    data, variance = np.empty((1, area)), np.empty((1, area))
+    new = (np.zeros((1, area)), np.empty((1, area)), np.empty((3, 3)),
+           np.empty(3))
+    tiling = (np.empty(4 * _LANES), np.empty(3 * _LANES * area),
+              np.empty(4, np.int64), np.empty((3, 4)))
+    scratch = (np.empty((1, 3, area)), np.empty(1, np.bool_), tiling)
+    sums = np.empty(2)
+    for i in range(boxes.shape[0]):
+        matrices[i] = 0.0
+        gradients[i] = 0.0
+        chi2[i] = 0.0
+        n_pixels[i] = _gather(image, error, mask, boxes[i], 0.0, data[0],
+                              variance[0])
+        if n_pixels[i] <= 0:
+            continue
+        pixels = (boxes[i:i + 1], data, variance, 0.0)
+        _normal_equations(parameters[i], 1, False, pixels, psf, scratch, new,
+                          new, sums)
+        chi2[i] = sums[1]
+        for a in range(3):
+            gradients[i, a] = new[3][a]
+            for b in range(a + 1):
+                matrices[i, a, b] = new[2][a, b]
+                matrices[i, b, a] = new[2][a, b]
+
+
 # A field of mixtures fitted to the stamps of n stars.
 #
 # shapes (K, 6) are the numbers that vary over the detector: log weight, x, y,
@@ -2697,7 +2741,7 @@ def solve(augmented, step):
 
 
 @_jit
-def _move_sources(sources, n_sources, sky, fit_sky, step):
+def _shift_sources(sources, n_sources, sky, fit_sky, step):
     """Add the step to a stamp's own numbers; return the sky."""
     for j in range(n_sources):
         for i in range(2):
@@ -2748,8 +2792,8 @@ def field_normal(stamps, weights, corners, basis, coefficients, sources,
                              hold[star], size, normal)
             _eliminate(normal, own, size)
             _back_substitute(normal, own, size, step)
-            sky[star] = _move_sources(sources[star], n_sources[star],
-                                      sky[star], fit_sky, step)
+            sky[star] = _shift_sources(sources[star], n_sources[star],
+                                       sky[star], fit_sky, step)
         chi2[star] = normal[size - 1, size - 1]
         if used[star]:
             _spread(normal, own, size, basis[star], spread, total, gradient)

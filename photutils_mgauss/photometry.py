@@ -170,6 +170,28 @@ class MixturePSFPhotometry(PSFPhotometry):
         self._warn_of_failures(result)
         return self.results
 
+    @staticmethod
+    def fit_many(images, coordinates, **kwargs):
+        """
+        Fit each star to the pixels of several images together.
+
+        Parameters
+        ----------
+        images : sequence of (data, psf, wcs)
+            The images.
+        coordinates : (n,) `~astropy.coordinates.SkyCoord`
+            Where the stars are.
+        **kwargs
+            Further keywords of `fit_many`.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            See `fit_many`.
+        """
+        from photutils_mgauss.sky_photometry import fit_many
+        return fit_many(images, coordinates, **kwargs)
+
     @property
     def _can_fit(self):
         return (isinstance(self.fitter, MixtureFitter)
