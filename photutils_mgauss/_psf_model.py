@@ -181,6 +181,11 @@ def flat_points(*arrays):
     numbers.
     """
     arrays = [np.asarray(a, dtype=float) for a in arrays]
+    shape = arrays[0].shape
+    if shape == arrays[1].shape and all(
+            a.size == 1 and a.ndim <= len(shape) for a in arrays[2:]):
+        # The usual case, at a fifth of the price of the general one.
+        return [a.ravel() for a in arrays], shape
     shape = np.broadcast_shapes(*(a.shape for a in arrays))
     x, y, *rest = arrays
     flat = [np.broadcast_to(a, shape).ravel() for a in (x, y)]

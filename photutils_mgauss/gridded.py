@@ -436,8 +436,8 @@ n_components=1)>
         """
         x, y, x_0, y_0 = strip_units([x, y, x_0, y_0])
         flux, unit = split_flux(flux)
-        x_0, y_0 = np.broadcast_arrays(np.asarray(x_0, float),
-                                       np.asarray(y_0, float))
+        if np.shape(x_0) != np.shape(y_0):
+            x_0, y_0 = np.broadcast_arrays(x_0, y_0)
         (x, y, flux, x_0, y_0), shape = flat_points(x, y, flux, x_0, y_0)
         out = np.empty(x.size)
         self._run(0, x, y, flux, x_0, y_0, out=out)

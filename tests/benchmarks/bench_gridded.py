@@ -39,15 +39,22 @@ def make_grid(k, n, size=1000, **kwargs):
                              **kwargs)
 
 
-def median_time(call, repeats=300):
-    """Return the median CPU time of a call, after one to warm up."""
-    call(0)
-    times = []
-    for i in range(repeats):
-        start = time.thread_time()
-        call(i)
-        times.append(time.thread_time() - start)
-    return np.median(times)
+def median_times(*calls, rounds=10, repeats=50):
+    """
+    Return the median CPU times of calls.
+
+    They take turns in blocks, so that all see the same load of the machine
+    and none pays for the memory that another one filled.
+    """
+    times = np.empty((rounds, len(calls), repeats))
+    for block in range(rounds):
+        for j, call in enumerate(calls):
+            call(0)
+            for i in range(repeats):
+                start = time.thread_time()
+                call(block * repeats + i)
+                times[block, j, i] = time.thread_time() - start
+    return np.median(times, axis=(0, 2))
 
 
 def evaluator(psf, x, y):
@@ -72,15 +79,15 @@ def bench_evaluate():
     peer = psf.to_gridded_psf(4, radius=12.5)
     matched = make_grid(3, 8, interpolation='components')
     for name, places in (('25x25 lattice', (x, y)), ('625 points', points)):
-        theirs = median_time(evaluator(peer, *places))
-        show(f'evaluate, {name}', median_time(evaluator(psf, *places)), theirs)
-        show(f'evaluate, {name}, matched',
-             median_time(evaluator(matched, *places)), theirs)
-    show('fit_deriv, 25x25 lattice', median_time(
+        ours, pairs, theirs = median_times(*(
+            evaluator(model, *places) for model in (psf, matched, peer)))
+        show(f'evaluate, {name}', ours, theirs)
+        show(f'evaluate, {name}, matched', pairs, theirs)
+    show('fit_deriv, 25x25 lattice', *median_times(
         lambda i: psf.fit_deriv(x, y, 10.0, 410 + 0.01 * i, 312.0)))
     large = make_grid(5, 30)
-    show('copy, 30x30 nodes of 5', median_time(lambda i: large.copy()),
-         median_time(lambda i: peer.copy()))
+    show('copy, 30x30 nodes of 5', *median_times(
+        lambda i: large.copy(), lambda i: peer.copy()))
     grid = large._grid
     print(f'memory of 30x30 nodes of 5: '
           f'{sum(a.nbytes for a in (*grid.arrays, grid.rows)) / 1e3:.0f} kB')
