@@ -23,6 +23,8 @@ except ImportError:  # a source tree that was never installed
 # Public name -> the module that owns it.
 _OWNERS = {
     'GriddedMixturePSF': 'gridded',
+    'PSFAssessment': 'assessment',
+    'assess_psf': 'assessment',
     'MixtureField': 'field',
     'fit_mixture_field': 'field',
     'select_psf_stars': 'selection',

@@ -846,7 +846,7 @@ def render_matched_image(x, y, flux, sums, x_grid, y_grid, integrated,
                          faintest, left, bottom, out):
     """Add stars as `render_image` does, with matched Gaussians blended."""
     rows = np.empty(sums.shape[1:])
-    slopes = np.empty((2,) + sums.shape[1:])
+    slopes = np.empty((2, *sums.shape[1:]))
     scratch = np.empty((3, _ERRORS.size))
     for i in range(x.size):
         match_rows(x[i], y[i], sums, x_grid, y_grid, rows, slopes)
