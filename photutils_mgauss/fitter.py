@@ -138,8 +138,10 @@ class _Problem:
         self.weights = None if weights is None else np.ravel(weights)
         self.start = np.array(model.parameters, dtype=float)
         names = model.param_names
-        self.free = np.array([not model.fixed[name] for name in names])
-        bounds = [model.bounds[name] for name in names]
+        # Each access to these properties visits all parameters of a group.
+        fixed, limits = model.fixed, model.bounds
+        self.free = np.array([not fixed[name] for name in names])
+        bounds = [limits[name] for name in names]
         self.lower = np.array([-np.inf if low is None else low
                                for low, _ in bounds])[self.free]
         self.upper = np.array([np.inf if high is None else high

@@ -121,10 +121,6 @@ class CramerRao:
 
     Attributes
     ----------
-    x_err, y_err : (n,) `~numpy.ndarray`
-        Of the positions [pix].
-    flux_err : (n,) `~numpy.ndarray`
-        Of the fluxes, in their unit.
     covariance : (n, 3, 3) `~numpy.ndarray`
         Of flux, x and y of each star.
     """
@@ -133,14 +129,17 @@ class CramerRao:
 
     @property
     def flux_err(self):
+        """The errors of the fluxes, (n,)."""
         return np.sqrt(self.covariance[:, 0, 0])
 
     @property
     def x_err(self):
+        """The errors of x, (n,) [pix]."""
         return np.sqrt(self.covariance[:, 1, 1])
 
     @property
     def y_err(self):
+        """The errors of y, (n,) [pix]."""
         return np.sqrt(self.covariance[:, 2, 2])
 
 

@@ -33,9 +33,8 @@ class MixturePSFPhotometry(PSFPhotometry):
     PSF photometry of many stars with a PSF made of Gaussians.
 
     A drop-in replacement of `photutils.psf.PSFPhotometry`: all its keywords,
-    methods and columns are here, and `~photutils.psf.IterativePSFPhotometry` aside every
-    recipe written for it runs unchanged. Stars are fitted in compiled code,
-    on all cores; grouped stars are fitted jointly.
+    methods and columns are here. Stars are fitted in compiled code, on all
+    cores; grouped stars are fitted jointly.
 
     Parameters
     ----------

@@ -84,7 +84,7 @@ def add_sky_positions(table, wcs):
     check_celestial(wcs)
     missing = {'x_fit', 'y_fit', 'x_err', 'y_err'} - set(table.colnames)
     if missing:
-        msg = f'table must have the column {sorted(missing)[0]}, got none'
+        msg = f'table must have the column {min(missing)}, got none'
         raise ValueError(msg)
     x, y = (np.asarray(table[name], float) for name in ('x_fit', 'y_fit'))
     vectors = pixel_to_vectors(wcs, x, y)
