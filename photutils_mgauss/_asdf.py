@@ -18,6 +18,7 @@ _BASE = 'asdf://photutils_mgauss/'
 CLASSES = {
     'GaussianMixture': 'mixture',
     'GriddedMixturePSF': 'gridded',
+    'MixtureField': 'field',
     'MultiGaussianPSFModel': 'model',
 }
 

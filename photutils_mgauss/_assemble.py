@@ -120,12 +120,19 @@ def assemble(epochs, references, match):
     by_id = _matches_by_id(detections, on_sky, match, unit)
     if by_id:
         matches, names = match_ids([one.ids for one in detections])
+        known = None
     else:
-        matches, names = _match_on_plane(detections, catalogue, match, unit)
+        matches, names, known = _match_on_plane(detections, catalogue,
+                                                match.tolerance(unit))
     _check_common(matches, detections)
-    found = _find_references(catalogue, references, names, matches, epochs,
-                             by_id)
-    return _stack(plane, unit, names, matches, detections, catalogue, found)
+    sightings = _stack(plane, unit, names, matches, detections, catalogue)
+    if references is None:
+        return sightings
+    if catalogue is None:
+        known = _named_references(references, names, matches, epochs)
+    elif known is None:
+        known = _find_references(sightings, match.tolerance(unit))
+    return replace(sightings, references=known)
 
 
 def _common_plane(vectors):
@@ -196,8 +203,13 @@ def _same_objects(detections, tolerance):
     return np.median(spread) < tolerance.pointing
 
 
-def _match_on_plane(detections, catalogue, match, unit):
-    tolerance = match.tolerance(unit)
+def _match_on_plane(detections, catalogue, tolerance):
+    """
+    Return matches by position, names, and the stars of the catalogue.
+
+    The last is None for a catalogue without positions; its objects that no
+    epoch has seen are not among the stars.
+    """
     years = [float(np.nanmean(one.years)) for one in detections]
     sigmas = []
     for one in detections:
@@ -211,32 +223,37 @@ def _match_on_plane(detections, catalogue, match, unit):
     matches = match_positions([one.plane for one in detections], sigmas,
                               years, tolerance, known)
     n_known = 0 if known is None else known[0].shape[1]
-    return matches, _names(matches, detections, catalogue, n_known)
+    seen = matches.seen.any(axis=0)
+    number = np.where(seen, np.cumsum(seen) - 1, -1)
+    matches = Matches(matches.rows[:, seen], matches.ambiguous[seen])
+    if known is None or catalogue.ids is None:
+        names = _names_of_epochs(matches, detections)
+    else:
+        names = _names_of_catalogue(catalogue.ids[seen[:n_known]],
+                                    matches.rows.shape[1])
+    return matches, names, None if known is None else number[:n_known]
 
 
-def _names(matches, detections, catalogue, n_known):
-    """Return the identifiers of stars matched by position."""
+def _names_of_catalogue(ids, n):
+    """Return the catalogue's identifiers, and new ones for the rest."""
+    rest = np.arange(n - len(ids))
+    if ids.dtype.kind in 'iu':
+        return np.append(ids, (ids.max() + 1 if len(ids) else 0) + rest)
+    return np.append(ids.astype(str), [f'new{k}' for k in rest])
+
+
+def _names_of_epochs(matches, detections):
+    """Return the epochs' identifiers if they are unique, else numbers."""
     n = matches.rows.shape[1]
-    running = np.arange(n)
-    if n_known and catalogue.ids is not None:
-        if n == n_known:
-            return catalogue.ids
-        if catalogue.ids.dtype.kind in 'iu':
-            start = catalogue.ids.max() + 1
-            return np.append(catalogue.ids,
-                             start + np.arange(n - n_known))
-        return np.append(catalogue.ids.astype(str),
-                         running[n_known:].astype(str))
-    if any(one.ids is None for one in detections):
-        return running
     ids = [one.ids for one in detections]
-    if len({array.dtype.kind in 'iuf' for array in ids}) > 1:
-        return running
+    if any(one is None for one in ids) or len(
+            {one.dtype.kind in 'iuf' for one in ids}) > 1:
+        return np.arange(n)
     first = matches.seen.argmax(axis=0)
     names = np.concatenate([ids[e][matches.rows[e, first == e]]
                             for e in range(len(ids))])
-    if len(np.unique(names)) < n or not matches.seen.any(axis=0).all():
-        return running
+    if len(np.unique(names)) < n:
+        return np.arange(n)
     out = np.empty(n, dtype=names.dtype)
     out[np.argsort(first, kind='stable')] = names
     return out
@@ -250,20 +267,32 @@ def _check_common(matches, detections):
         raise ValueError(msg)
 
 
-def _find_references(catalogue, references, names, matches, epochs, by_id):
-    """Return the star number of each reference, -1 where there is none."""
-    if references is None:
-        return np.empty(0, dtype=int)
-    if catalogue is None:
-        return _named_references(references, names, matches, epochs)
-    has_place = np.isfinite(catalogue.values[:2]).all(axis=0).any()
-    if not by_id and has_place:
-        return np.arange(len(catalogue.kinds))
-    if catalogue.ids is None:
-        msg = ("references must have a column 'id' for epochs matched by "
-               'id, or whose references have no positions')
+def _find_references(sightings, tolerance):
+    """Return the star of each object of a catalogue, -1 where not seen."""
+    catalogue = sightings.catalogue
+    if catalogue.ids is not None:
+        return _lookup(catalogue.ids, sightings.names)
+    if not np.isfinite(catalogue.values[:2]).all(axis=0).any():
+        msg = ("references must have a column 'id' or positions to be found "
+               'among the stars')
         raise ValueError(msg)
-    return _lookup(catalogue.ids, names)
+    found = np.full(len(catalogue.kinds), -1)
+    for e in range(len(sightings.epoch_years)):
+        # Epoch by epoch: frames that differ would blur a star's mean place.
+        stars = _find_in_epoch(sightings, e, tolerance)
+        new = (found < 0) & ~np.isin(stars, found)
+        found[new] = stars[new]
+    return found
+
+
+def _find_in_epoch(sightings, e, tolerance):
+    catalogue, year = sightings.catalogue, sightings.epoch_years[e]
+    sigma = np.sqrt(sightings.covariance[[0, 2], e].mean(axis=0))
+    known = (catalogue.values[:2], catalogue.motion(),
+             np.nan_to_num(catalogue.year, nan=year))
+    matches = match_positions([sightings.places[:, e]], [sigma], [year],
+                              tolerance, known)
+    return matches.rows[0, :len(catalogue.kinds)]
 
 
 def _lookup(ids, names):
@@ -298,7 +327,7 @@ def _marked(table, name):
     return np.ma.filled(np.ma.asarray(table[name]), False).astype(bool)
 
 
-def _stack(plane, unit, names, matches, detections, catalogue, found):
+def _stack(plane, unit, names, matches, detections, catalogue):
     """Return the `Sightings`, planes without WCS tied to the others."""
     places = matches.take([one.plane for one in detections])
     years = [one.years for one in detections]
@@ -313,7 +342,7 @@ def _stack(plane, unit, names, matches, detections, catalogue, found):
         plane, unit, names, matches, places,
         matches.take([one.covariance for one in detections]), years, usable,
         matches.take([one.flux for one in detections]),
-        [None] * len(detections), catalogue, found)
+        [None] * len(detections), catalogue, np.empty(0, dtype=int))
 
 
 def tie_planes(sightings, on_sky, transform):

@@ -8,6 +8,7 @@ is what was written, bit by bit. Nothing is pickled.
 """
 import warnings
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 from astropy.io import fits, registry
@@ -35,6 +36,10 @@ class _Read(registry.UnifiedReadWrite):
     ValueError
         If the file is damaged, was made by a newer version, or holds
         something else.
+
+    Notes
+    -----
+    Every number comes back bit by bit.
     """
 
     def __init__(self, instance, cls):
@@ -61,6 +66,10 @@ class _Write(registry.UnifiedReadWrite):
     ------
     OSError
         If the file exists and ``overwrite`` is not set.
+
+    Notes
+    -----
+    Every number is written as a float64 column, none as a header card.
     """
 
     def __init__(self, instance, cls):
@@ -70,17 +79,30 @@ class _Write(registry.UnifiedReadWrite):
         self.registry.write(self._instance, *args, **kwargs)
 
 
-def storable(cls):
+def storable(**tables):
     """
-    Give a class ``read`` and ``write``; used as its decorator.
+    Give a class ``read`` and ``write``; its decorator.
 
     The class has ``_to_tables()``, which returns a dict of tables, each a
-    dict of columns; the class method ``_from_tables(tables)``, the inverse
-    of it; and ``_columns``, which maps the names of its tables to dicts of
-    column names and units. Further tables may come with them.
+    dict of columns, and the class method ``_from_tables(tables)``, the
+    inverse of it.
+
+    Parameters
+    ----------
+    **tables : dict
+        The tables every file has, each a dict of column names and units.
+        Further tables may come with them.
     """
-    cls.read = registry.UnifiedReadWriteMethod(_Read)
-    cls.write = registry.UnifiedReadWriteMethod(_Write)
+    def decorate(cls):
+        cls._columns = tables
+        cls.read = registry.UnifiedReadWriteMethod(_Read)
+        cls.write = registry.UnifiedReadWriteMethod(_Write)
+        _register(cls)
+        return cls
+    return decorate
+
+
+def _register(cls):
     formats = {'fits': (is_fits, _read_fits, _write_fits),
                'asdf': (_is_asdf, _read_asdf, _write_asdf)}
     for name, (identify, read, write) in formats.items():
@@ -88,13 +110,19 @@ def storable(cls):
         with registry.delay_doc_updates(cls):
             registry.register_reader(name, cls, _bound(read, cls))
             registry.register_writer(name, cls, write)
-    return cls
 
 
 def _bound(read, cls):
     def reader(file):
         return read(cls, file)
     return reader
+
+
+def table_columns(table):
+    """Return the columns of a table without units, as files hold them."""
+    columns = {name: np.asarray(table[name]) for name in table.colnames}
+    return {name: column.astype(str) if column.dtype.kind == 'O' else column
+            for name, column in columns.items()}
 
 
 def check_version(version, name):
@@ -202,14 +230,13 @@ def _write_asdf(stored, file, *, overwrite=False):
     import asdf
 
     from photutils_mgauss._asdf import enabled
-    if hasattr(file, 'write') or overwrite:
-        target = file
-    else:
-        target = open(file, 'xb')  # noqa: SIM115
     with enabled():
-        asdf.AsdfFile({'psf': stored}).write_to(target)
-    if target is not file:
-        target.close()
+        tree = asdf.AsdfFile({'psf': stored})
+        if hasattr(file, 'write'):
+            tree.write_to(file)
+            return
+        with Path(file).open('wb' if overwrite else 'xb') as target:
+            tree.write_to(target)
 
 
 def _read_asdf(cls, file):

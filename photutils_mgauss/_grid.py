@@ -125,7 +125,7 @@ def integrals(weights, means, covariances):
 def from_integrals(sums):
     """Return the mixture of K Gaussians with these integrals (K, 6)."""
     sums = sums[sums[:, 0] != 0]
-    flux, x, y, xx, xy, yy = (sums / sums[:, :1]).T
+    _, x, y, xx, xy, yy = (sums / sums[:, :1]).T
     covariances = np.stack([xx - x * x, xy - x * y, xy - x * y, yy - y * y],
                            axis=-1).reshape(-1, 2, 2)
     return GaussianMixture(sums[:, 0] / sums[:, 0].sum(),

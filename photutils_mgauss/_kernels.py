@@ -846,7 +846,7 @@ def render_matched_image(x, y, flux, sums, x_grid, y_grid, integrated,
                          faintest, left, bottom, out):
     """Add stars as `render_image` does, with matched Gaussians blended."""
     rows = np.empty(sums.shape[1:])
-    slopes = np.empty((2,) + sums.shape[1:])
+    slopes = np.empty((2, *sums.shape[1:]))
     scratch = np.empty((3, _ERRORS.size))
     for i in range(x.size):
         match_rows(x[i], y[i], sums, x_grid, y_grid, rows, slopes)
@@ -2502,6 +2502,50 @@ def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
             fitted_sky[stars, 1] = sqrt(factor * sky_variance)
         outcome[stars, 0] = status
         outcome[stars, 1] = evaluations
+
+
+@_jit
+def star_jet(x_0, y_0, box, psf, out):
+    """Put the unit-flux PSF in a box, d/dx_0 and d/dy_0 into out (3, n)."""
+    tiling = (np.empty(4 * _LANES), np.empty(3 * _LANES * box[3]),
+              np.empty(4, np.int64), np.empty((3, 4)))
+    _fill_jet(x_0, y_0, box, psf, tiling, out)
+
+
+@_jit
+def star_equations(image, error, mask, boxes, parameters, psf, chi2, n_pixels,
+                   matrices, gradients):
+    """
+    Evaluate stars, each by itself: chi2 (n,), (n, 3, 3) and (n, 3).
+
+    parameters (n, 3) are flux, x and y. Stars without pixels contribute
+    nothing; n_pixels (n,) is -1 where an error is not positive and finite.
+    """
+    area = max(1, np.max(boxes[:, 2] * boxes[:, 3]))
+    data, variance = np.empty((1, area)), np.empty((1, area))
+    new = (np.zeros((1, area)), np.empty((1, area)), np.empty((3, 3)),
+           np.empty(3))
+    tiling = (np.empty(4 * _LANES), np.empty(3 * _LANES * area),
+              np.empty(4, np.int64), np.empty((3, 4)))
+    scratch = (np.empty((1, 3, area)), np.empty(1, np.bool_), tiling)
+    sums = np.empty(2)
+    for i in range(boxes.shape[0]):
+        matrices[i] = 0.0
+        gradients[i] = 0.0
+        chi2[i] = 0.0
+        n_pixels[i] = _gather(image, error, mask, boxes[i], 0.0, data[0],
+                              variance[0])
+        if n_pixels[i] <= 0:
+            continue
+        pixels = (boxes[i:i + 1], data, variance, 0.0)
+        _normal_equations(parameters[i], 1, False, pixels, psf, scratch, new,
+                          new, sums)
+        chi2[i] = sums[1]
+        for a in range(3):
+            gradients[i, a] = new[3][a]
+            for b in range(a + 1):
+                matrices[i, a, b] = new[2][a, b]
+                matrices[i, b, a] = new[2][a, b]
 
 
 # A field of mixtures fitted to the stamps of n stars.

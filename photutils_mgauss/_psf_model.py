@@ -7,6 +7,10 @@ from astropy.units import Quantity, Unit, UnitsError
 
 from photutils_mgauss import _compat
 
+# How files hold the parameters of a model: the columns and their units.
+PARAMETER_COLUMNS = dict.fromkeys(
+    ('name', 'value', 'unit', 'fixed', 'lower', 'upper'), '')
+
 
 class PSFParameter(Parameter):
     """A Parameter that is cheap to copy."""
@@ -32,10 +36,6 @@ class PSFModel(Fittable2DModel):
     flux = PSFParameter(default=1, description='Total flux of the star.')
     x_0 = PSFParameter(default=0, description='Position of the star in x.')
     y_0 = PSFParameter(default=0, description='Position of the star in y.')
-
-    # How files hold the parameters: column and unit.
-    _parameter_columns = {'name': '', 'value': '', 'unit': '', 'fixed': '',
-                          'lower': '', 'upper': ''}
 
     # In standard deviations of the widest Gaussian; 5.5 leaves out 3e-7 of
     # its flux.

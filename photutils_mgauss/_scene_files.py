@@ -62,18 +62,15 @@ def _csst(scene):
 
 def _header(scene, unit=None, scale=1.0):
     """Return the header, with the WCS as TAN-SIP."""
-    ny, nx = scene.image.shape
-    limits = (-0.5, nx - 0.5), (-0.5, ny - 0.5)
-    header = scene.wcs.to_fits_sip(limits, degree=3, inv_degree=5,
-                                   max_pix_error=1e-3, max_inv_pix_error=None,
-                                   npoints=16)
+    camera, exposure = scene.instrument, scene.exposure
+    header = exposure.fits_header(camera.shape, camera.pixel_scale)
     if unit is not None:
         header['BUNIT'] = unit
-    camera, exposure = scene.instrument, scene.exposure
     for key, value, comment in (
             ('FILTER', exposure.band.name, 'band'),
             ('DETECTOR', exposure.detector, 'number of the detector'),
             ('DATE-AVG', scene.time.isot, 'middle of the exposure'),
+            ('MJD-AVG', scene.time.mjd, 'middle of the exposure'),
             ('TIMESYS', 'TDB', 'time scale'),
             ('EXPTIME', camera.exposure_time, '[s] exposure time'),
             ('ZEROPNT', exposure.band.zeropoint, 'AB mag of 1 electron/s'),

@@ -20,6 +20,7 @@ from functools import cached_property
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import ICRS, get_body_barycentric_posvel
+from astropy.io import fits
 from astropy.modeling.models import (
     AffineTransformation2D,
     Identity,
@@ -218,6 +219,23 @@ class Exposure:
         wcs.pixel_shape = (nx, ny)
         return wcs
 
+    def fits_header(self, shape, pixel_scale):
+        """
+        Return the WCS as TAN-SIP, which it is exactly.
+
+        Parameters
+        ----------
+        shape : (ny, nx) tuple of int
+            The pixels of the image.
+        pixel_scale : float
+            The nominal side of a pixel [arcsec].
+
+        Returns
+        -------
+        `~astropy.io.fits.Header`
+        """
+        return _Geometry(self, tuple(shape), pixel_scale).header
+
     def pixels(self, sources, shape, pixel_scale):
         """
         Return where sources fall, whatever their distance from the image.
@@ -353,6 +371,26 @@ class _Geometry:
         forward.inverse = self._polynomials(
             9, lambda x, y: self.undistort(np.stack([x, y])))
         return forward
+
+    @property
+    def header(self):
+        """The WCS in the convention of SIP."""
+        exposure = self.exposure
+        header = fits.Header({'RADESYS': 'ICRS', 'LONPOLE': 180.0})
+        for i, (kind, value, pixel) in enumerate((
+                ('RA--', exposure.ra, self.centre[0]),
+                ('DEC-', exposure.dec, self.centre[1])), start=1):
+            header[f'CTYPE{i}'] = f'{kind}-TAN-SIP'
+            header[f'CUNIT{i}'] = 'deg'
+            header[f'CRVAL{i}'], header[f'CRPIX{i}'] = value, pixel + 1
+            for j in (1, 2):
+                header[f'CD{i}_{j}'] = self.matrix[i - 1, j - 1]
+        for letter, terms in zip('AB', exposure.distortion, strict=True):
+            header[f'{letter}_ORDER'] = 3
+            for i, j in np.argwhere(terms):
+                header[f'{letter}_{i}_{j}'] = (terms[i, j]
+                                               / self.radius ** (i + j))
+        return header
 
     def _polynomials(self, degree, function):
         """Return the model that interpolates a map (x, y) -> (2, n)."""

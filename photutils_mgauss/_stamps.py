@@ -26,9 +26,12 @@ _STIFFNESS = 1.0
 # often the map to centroid errors follows the solution.
 _ASTROMETRY = 100.0
 _ASTROMETRY_ROUNDS = 2
-# The steps every split gets, and how many of the best go on.
-_TRIAL_STEPS = 8
+# The steps every split gets, and the better half again; how many of the best
+# go on at the end; and the steps of fits with fewer Gaussians than asked for,
+# which need not converge.
+_TRIAL_STEPS = 6
 _FINALISTS = 2
+_PREVIEW_STEPS = 40
 
 
 class Problem(NamedTuple):
@@ -151,19 +154,28 @@ def search(stamp, problem, spaces):
 
     One Gaussian is fitted alone; then, one at a time, another is added by
     every way of `_splits`, each is improved for a few steps, and the best is
-    fitted. Of K geometric starts at once, one in three or fewer finds the
+    fitted. Of starts with K Gaussians at once one in three or fewer finds the
     minimum; this way nearly all do.
     """
     best = run(stamp, problem, spaces, _core(stamp, problem))
     for k in range(2, problem.n_components + 1):
-        trials = [run(stamp, problem, spaces, start, _TRIAL_STEPS)
-                  for start in _splits(best.shapes, problem)]
-        trials.sort(key=lambda trial: trial.cost)
-        n_best = _FINALISTS if k == problem.n_components else 1
-        best = min((run(stamp, problem, spaces, trial.shapes)
-                    for trial in trials[:n_best]),
-                   key=lambda solution: solution.cost)
+        trials = _improved(stamp, problem, spaces,
+                           _splits(best.shapes, problem), _TRIAL_STEPS)
+        half = [trial.shapes for trial in trials[:max(2, len(trials) // 2)]]
+        trials = _improved(stamp, problem, spaces, half, _TRIAL_STEPS)
+        last = k == problem.n_components
+        n_best, steps = (_FINALISTS, _MAX_STEPS) if last else (
+            1, _PREVIEW_STEPS)
+        best, *_ = _improved(stamp, problem, spaces,
+                             [trial.shapes for trial in trials[:n_best]],
+                             steps)
     return best
+
+
+def _improved(stamp, problem, spaces, starts, steps):
+    """Return the starts after some steps, the best first."""
+    return sorted((run(stamp, problem, spaces, start, steps)
+                   for start in starts), key=lambda solution: solution.cost)
 
 
 def refine_astrometry(stamp, problem, spaces, solution):

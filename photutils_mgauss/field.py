@@ -27,6 +27,7 @@ from photutils_mgauss._field_fit import (
     model_stamps,
     to_vector,
 )
+from photutils_mgauss._files import storable, table_columns
 from photutils_mgauss._star_stamps import cut_stamps, remove_star_noise
 from photutils_mgauss._tables import as_image, read_sources
 from photutils_mgauss._validation import as_integer, as_real, as_shape
@@ -42,6 +43,10 @@ _MAX_NEIGHBOURS = 12
 _STARS_PER_TERM = 2
 
 
+@storable(detector={'ny': 'pix', 'nx': 'pix', 'radius': 'pix',
+                    'accuracy': ''},
+          terms={'coefficient': ''}, errors={'covariance': ''},
+          stars={'x': 'pix', 'y': 'pix', 'used': ''}, dropped={'id': ''})
 @dataclass(frozen=True, eq=False, repr=False)
 class MixtureField:
     r"""
@@ -100,6 +105,33 @@ class MixtureField:
         return (f'<MixtureField(n_components={self.n_components}, '
                 f'degree={self.degree}, shape={self.shape}, '
                 f'{used} of {len(self.stars)} stars)>')
+
+    def _to_tables(self):
+        ny, nx = self.shape
+        stars = table_columns(self.stars)
+        if self.residual_stars is not None:
+            stars['residual'] = self.residual_stars
+        dropped = _dropped(np.array([], str)) if (
+            self.dropped is None) else self.dropped
+        return {'detector': {'ny': [ny], 'nx': [nx],
+                             'radius': [float(self.radius)],
+                             'accuracy': [float(self.accuracy)]},
+                'terms': {'coefficient': self.coefficients},
+                'errors': {'covariance': self.covariance},
+                'stars': stars, 'dropped': table_columns(dropped)}
+
+    @classmethod
+    def _from_tables(cls, tables):
+        detector, stars = tables['detector'], dict(tables['stars'])
+        coefficients = tables['terms']['coefficient']
+        covariance = tables['errors']['covariance']
+        n_terms, n = len(coefficients), len(covariance)
+        residual = stars.pop('residual', None)
+        return cls(coefficients.reshape(n_terms, -1, 6),
+                   (int(detector['ny'][0]), int(detector['nx'][0])),
+                   float(detector['radius'][0]), covariance.reshape(n, n),
+                   QTable(stars), residual, float(detector['accuracy'][0]),
+                   QTable(tables['dropped']))
 
     @property
     def n_components(self):

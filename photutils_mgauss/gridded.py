@@ -18,10 +18,11 @@ from astropy.table import QTable
 from photutils.psf import GriddedPSFModel, ImagePSF
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._files import storable
+from photutils_mgauss._files import storable, table_columns
 from photutils_mgauss._grid import checked_arrays, make_grid, split_seams
 from photutils_mgauss._nodes import NodeImages, fit_nodes, plain_report
 from photutils_mgauss._psf_model import (
+    PARAMETER_COLUMNS,
     PSFModel,
     flat_points,
     split_flux,
@@ -44,7 +45,11 @@ _KERNELS = {
 _OUTSIDE = ('clamp', 'raise', 'nan')
 
 
-@storable
+@storable(model=dict.fromkeys(
+              ('name', 'pixel_integrated', 'interpolation', 'outside'), ''),
+          parameters=PARAMETER_COLUMNS,
+          nodes={'x': 'pix', 'y': 'pix', 'scale': '', 'weight': '',
+                 'mean': 'pix', 'covariance': 'pix2'})
 class GriddedMixturePSF(PSFModel):
     """
     A PSF that varies over a detector: mixtures of Gaussians on a grid.
@@ -113,13 +118,6 @@ n_components=1)>
     >>> psf.mixture_at(50, 20).weights
     array([0.4, 0.4, 0.1, 0.1])
     """
-
-    _columns = {
-        'model': {'name': '', 'pixel_integrated': '', 'interpolation': '',
-                  'outside': ''},
-        'parameters': PSFModel._parameter_columns,
-        'nodes': {'x': 'pix', 'y': 'pix', 'scale': '', 'weight': '',
-                  'mean': 'pix', 'covariance': 'pix2'}}
 
     def __init__(self, mixtures, grid_xypos, *, flux=1, x_0=0, y_0=0,
                  pixel_integrated=False, scales=None, interpolation='blend',
@@ -719,10 +717,8 @@ n_components=1)>
                  'outside': [self._outside]}
         nodes = {'x': x, 'y': y, 'scale': grid.scales, 'weight': grid.weights,
                  'mean': grid.means, 'covariance': grid.covariances}
-        report = {name: np.asarray(self._report[name])
-                  for name in self._report.colnames}
         return {'model': model, 'parameters': self._parameter_table(),
-                'nodes': nodes, 'report': report}
+                'nodes': nodes, 'report': table_columns(self._report)}
 
     @classmethod
     def _from_tables(cls, tables):

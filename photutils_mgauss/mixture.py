@@ -26,7 +26,7 @@ class Moments(NamedTuple):
     covariance: np.ndarray
 
 
-@storable
+@storable(components={'weight': '', 'mean': 'pix', 'covariance': 'pix2'})
 @dataclass(frozen=True, eq=False, repr=False)
 class GaussianMixture:
     r"""
@@ -98,9 +98,6 @@ class GaussianMixture:
     def __repr__(self):
         return (f'<GaussianMixture of {self.n_components}, weights '
                 f'{np.array2string(self.weights, precision=3)}>')
-
-    _columns = {'components': {'weight': '', 'mean': 'pix',
-                               'covariance': 'pix2'}}
 
     def _to_tables(self):
         return {'components': {'weight': self.weights, 'mean': self.means,

@@ -13,6 +13,7 @@ import numpy as np
 from photutils_mgauss import _kernels
 from photutils_mgauss._files import storable
 from photutils_mgauss._psf_model import (
+    PARAMETER_COLUMNS,
     PSFModel,
     PSFParameter,
     flat_points,
@@ -35,7 +36,8 @@ _RHO_BOUNDS = (-0.9999, 0.9999)
 _FRACTION_BOUNDS = (0, 1)
 
 
-@storable
+@storable(model={'name': '', 'pixel_integrated': ''},
+          parameters=PARAMETER_COLUMNS)
 class MultiGaussianPSFModel(PSFModel):
     r"""
     A PSF that is a sum of K correlated Gaussians.
@@ -276,9 +278,6 @@ class MultiGaussianPSFModel(PSFModel):
             columns += shape.derivatives(k, flux, jets[k]) if any(
                 free[first:first + 5]) else [value] * 5
         return columns
-
-    _columns = {'model': {'name': '', 'pixel_integrated': ''},
-                'parameters': PSFModel._parameter_columns}
 
     def _to_tables(self):
         return {'model': {'name': [str(self.name or '')],

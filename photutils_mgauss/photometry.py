@@ -33,7 +33,7 @@ class MixturePSFPhotometry(PSFPhotometry):
     PSF photometry of many stars with a PSF made of Gaussians.
 
     A drop-in replacement of `photutils.psf.PSFPhotometry`: all its keywords,
-    methods and columns are here, and `IterativePSFPhotometry` aside every
+    methods and columns are here, and `~photutils.psf.IterativePSFPhotometry` aside every
     recipe written for it runs unchanged. Stars are fitted in compiled code,
     on all cores; grouped stars are fitted jointly.
 
@@ -169,6 +169,28 @@ class MixturePSFPhotometry(PSFPhotometry):
                                         error is not None)
         self._warn_of_failures(result)
         return self.results
+
+    @staticmethod
+    def fit_many(images, coordinates, **kwargs):
+        """
+        Fit each star to the pixels of several images together.
+
+        Parameters
+        ----------
+        images : sequence of (data, psf, wcs)
+            The images.
+        coordinates : (n,) `~astropy.coordinates.SkyCoord`
+            Where the stars are.
+        **kwargs
+            Further keywords of `fit_many`.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            See `fit_many`.
+        """
+        from photutils_mgauss.sky_photometry import fit_many
+        return fit_many(images, coordinates, **kwargs)
 
     @property
     def _can_fit(self):

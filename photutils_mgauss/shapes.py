@@ -24,7 +24,7 @@ _MAX_STEPS = 500
 
 
 class ShapeStatus(IntEnum):
-    """How adaptive moments ended; `sentence` says it in words."""
+    """How adaptive moments ended; ``sentence`` says it in words."""
 
     CONVERGED = 0
     STOPPED = 1

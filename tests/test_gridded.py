@@ -9,7 +9,12 @@ from hypothesis import given, settings
 from numpy.testing import assert_allclose, assert_array_equal
 from strategies import SETTINGS, numbers
 
-from photutils_mgauss import GaussianMixture, GriddedMixturePSF, blend
+from photutils_mgauss import (
+    GaussianMixture,
+    GriddedMixturePSF,
+    _kernels,
+    blend,
+)
 
 Y, X = np.mgrid[:15, :15]
 
@@ -224,5 +229,166 @@ def test_bad_mixtures_and_scales_are_named():
         GriddedMixturePSF([mixture, 3], [(0, 0), (1, 0)])
     with pytest.raises(ValueError, match='at least one element'):
         GriddedMixturePSF([], np.empty((0, 2)))
-    with pytest.raises(ValueError, match='scales must be positive and finite, got -1'):
+    with pytest.raises(ValueError, match='scales must be positive and finite'):
         GriddedMixturePSF([mixture], [(0, 0)], scales=[-1])
+
+
+@given(**positions)
+@settings(**SETTINGS)
+def test_matched_gaussians_keep_flux_centroid_and_second_moments(x_0, y_0):
+    # Those of the blended images, whatever the order of the Gaussians.
+    blended = make_grid(scales=[1, 1.1, 1.2, 1, 0.9, 1])
+    matched = make_grid(scales=[1, 1.1, 1.2, 1, 0.9, 1],
+                        interpolation='components')
+    images = blended.mixture_at(x_0, y_0)
+    gaussians = matched.mixture_at(x_0, y_0)
+    assert gaussians.n_components <= 3
+    assert_allclose(matched.scale_at(x_0, y_0), blended.scale_at(x_0, y_0))
+    assert_allclose(gaussians.moments().mean, images.moments().mean,
+                    atol=1e-12)
+    assert_allclose(gaussians.moments().covariance,
+                    images.moments().covariance, rtol=1e-11, atol=1e-12)
+    x, y = X + x_0 - 7, Y + y_0 - 7
+    assert_allclose(
+        matched.evaluate(x, y, 2, x_0, y_0), 2 * matched.scale_at(x_0, y_0)
+        * gaussians.evaluate(x - x_0, y - y_0), rtol=1e-10)
+
+
+@pytest.mark.parametrize('integrated', [False, True])
+@given(**positions)
+@settings(**SETTINGS)
+def test_derivatives_of_matched_gaussians_are_exact(integrated, x_0, y_0):
+    psf = make_grid(interpolation='components', pixel_integrated=integrated)
+    h = 1e-4
+    if min(np.abs(psf.grid_xypos - (x_0, y_0)).min(axis=0)) < 2 * h:
+        return
+    x, y = X + np.rint(x_0) - 7, Y + np.rint(y_0) - 7
+    by_flux, by_x, by_y = psf.fit_deriv(x, y, 50, x_0, y_0)
+    assert_allclose(by_flux, psf.evaluate(x, y, 1, x_0, y_0), rtol=1e-9)
+    for column, dx, dy in ((by_x, h, 0), (by_y, 0, h)):
+        expected = (psf.evaluate(x, y, 50, x_0 + dx, y_0 + dy)
+                    - psf.evaluate(x, y, 50, x_0 - dx, y_0 - dy)) / (2 * h)
+        assert_allclose(column, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_matching_undoes_a_shuffle_of_the_gaussians(rng):
+    nodes = [GaussianMixture([0.6, 0.3, 0.1], [[0, 0], [0.1, 0], [0, 0.1]],
+                             [np.eye(2) * (1 + 0.01 * i) * s
+                              for s in (1, 3, 9)]) for i in range(9)]
+    places = [(i % 3, i // 3) for i in range(9)]
+    shuffled = []
+    for node in nodes:
+        order = rng.permutation(3)
+        shuffled.append(GaussianMixture(node.weights[order], node.means[order],
+                                        node.covariances[order]))
+    plain, mixed = (GriddedMixturePSF(m, places, interpolation='components')
+                    for m in (nodes, shuffled))
+    for x_0, y_0 in rng.uniform(0, 2, (10, 2)):
+        expected = plain.mixture_at(x_0, y_0)
+        assert_allclose(mixed.evaluate(X, Y, 1, x_0, y_0),
+                        expected.evaluate(X - x_0, Y - y_0), rtol=1e-9)
+        assert_allclose(sorted(expected.weights), [0.1, 0.3, 0.6])
+
+
+@pytest.mark.parametrize('interpolation', ['blend', 'components'])
+def test_stamps_and_points_of_many_stars_follow_the_interpolation(
+        rng, interpolation):
+    psf = make_grid(interpolation=interpolation)
+    x_0, y_0 = rng.uniform(0, 100, 6), rng.uniform(0, 50, 6)
+    stamps = psf.render(x_0, y_0, 3, 9)
+    dy, dx = np.mgrid[-4:5, -4:5]
+    for i in range(6):
+        assert_allclose(stamps[i], psf.evaluate(
+            dx + np.rint(x_0[i]), dy + np.rint(y_0[i]), 3, x_0[i], y_0[i]),
+            rtol=1e-9)
+    points = psf.evaluate(x_0 + 0.3, y_0, 1, x_0, y_0)
+    assert_allclose(points, [psf.evaluate(x_0[i] + 0.3, y_0[i], 1, x_0[i],
+                                          y_0[i]) for i in range(6)])
+
+
+def test_negative_weights_cannot_be_matched():
+    signed = GaussianMixture([-0.2, 1.2], np.zeros((2, 2)),
+                             [np.eye(2), 2 * np.eye(2)])
+    with pytest.raises(ValueError, match="must be 'blend' where weights are"):
+        GriddedMixturePSF([signed], [(0, 0)], interpolation='components')
+    with pytest.raises(ValueError, match='interpolation must be one of'):
+        GriddedMixturePSF([signed], [(0, 0)], interpolation='linear')
+
+
+def test_outside_the_grid_is_an_error_if_wanted():
+    psf = make_grid(outside='raise')
+    assert np.isfinite(psf.evaluate(X, Y, 1, 100, 50)).all()
+    for call in (lambda: psf.evaluate(X, Y, 1, 100.1, 50),
+                 lambda: psf.fit_deriv(X, Y, 1, 30, -1),
+                 lambda: psf.render([3, 300], [3, 3], 1, 5),
+                 lambda: psf.mixture_at(-1, 0), lambda: psf.scale_at(-1, 0)):
+        with pytest.raises(ValueError, match='must be inside the grid of no'):
+            call()
+
+
+def test_outside_the_grid_is_nan_if_wanted():
+    psf = make_grid(outside='nan')
+    assert np.isnan(psf.evaluate(X, Y, 1, 101, 50)).all()
+    assert np.isnan(psf.fit_deriv(X, Y, 1, 30, -1)).all()
+    values = psf.evaluate([1.0, 2.0], [1.0, 2.0], 1, np.array([1.0, -2.0]),
+                          np.array([1.0, 2.0]))
+    assert list(np.isnan(values)) == [False, True]
+    stamps = psf.render([3, 300, 4], [3, 3, 4], 1, 5)
+    assert list(np.isnan(stamps).all(axis=(1, 2))) == [False, True, False]
+    assert not np.isnan(stamps[[0, 2]]).any()
+
+
+def test_missing_nodes_are_bridged_from_their_neighbours():
+    positions = [(x, y) for y in range(3) for x in range(3)]
+    mixtures = [GaussianMixture([1], [[0.1 * x, 0]], [np.eye(2) * (1 + y)])
+                for x, y in positions]
+    scales = [1 + x for x, _ in positions]
+    mixtures[4] = None
+    scales[4] = np.nan
+    psf = GriddedMixturePSF(mixtures, positions, scales=scales)
+    assert list(np.flatnonzero(psf.report['bridged'])) == [4]
+    assert psf.n_components == 1
+    # The four nearest nodes are symmetric around it.
+    assert_allclose(psf.mixtures[4].moments().mean, [0.1, 0], atol=1e-12)
+    assert_allclose(psf.scale_at(1, 1), 2, rtol=1e-12)
+    assert np.isfinite(psf(X, Y)).all()
+    with pytest.raises(ValueError, match='element that is not None'):
+        GriddedMixturePSF([None], [(0, 0)])
+
+
+def test_a_bridge_over_gaussians_of_both_signs_is_the_nearest_node():
+    signed = GaussianMixture([-0.2, 1.2], np.zeros((2, 2)),
+                             [np.eye(2), 2 * np.eye(2)])
+    psf = GriddedMixturePSF([signed, None], [(0, 0), (9, 0)])
+    assert_array_equal(psf.mixtures[1].weights, signed.weights)
+
+
+def test_galsim_draws_the_same_star():
+    pytest.importorskip('galsim')
+    psf = make_grid(scales=[1, 1.1, 1.2, 1, 0.9, 1])
+    image = psf.to_galsim(40, 20).drawImage(nx=25, ny=25, scale=1,
+                                            method='no_pixel', dtype=float)
+    expected = psf.scale_at(40, 20) * psf.mixture_at(40, 20).render(
+        (25, 25), 12, 12)
+    assert_allclose(image.array, expected, atol=1e-7 * expected.max())
+
+
+def test_a_large_grid_is_small_in_memory(rng):
+    n = 900
+    mixtures = [some_mixture(rng, 5) for _ in range(n)]
+    places = [(i % 30, i // 30) for i in range(n)]
+    psf = GriddedMixturePSF(mixtures, places)
+    grid = psf._grid
+    assert sum(a.nbytes for a in (*grid.arrays, grid.rows)) < 1e6
+    assert psf.copy()._grid is grid
+
+
+def test_the_exponential_function_is_exact_to_the_last_digit(rng):
+    x = np.concatenate([-rng.uniform(0, 688, 100_000), [0, -1e-300, -688]])
+    out = np.empty(x.size)
+    _kernels.exponentials(x, out)
+    assert_allclose(out, np.exp(x), rtol=3e-16)
+    extremes = np.array([-700, -1e5, -1e300, -np.inf, np.nan])
+    out = np.empty(5)
+    _kernels.exponentials(extremes, out)
+    assert_array_equal(out, [0, 0, 0, 0, np.nan])

@@ -811,3 +811,57 @@ def test_threads_and_one_thread_agree_exactly(scene, quasars):
                                        executor=pool_).fit(epochs).stars
                     for pool_ in (pool, None))
     assert_allclose(one['pmra'].value, two['pmra'].value, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize('match_by', ['id', 'sky', 'auto'])
+def test_references_without_identifiers_are_found_by_place(match_by, rng):
+    truth = make_truth(rng, n_stars=200, n_qso=150)
+    which = np.flatnonzero(truth.qso)
+    catalogue = Table({'ra': np.append(truth.ra[which], 10.0),
+                       'dec': np.append(truth.dec[which], -5.0),
+                       'class': np.full(151, 'qso')})
+    fit = ProperMotionFitter(references=catalogue, match_by=match_by).fit(
+        observe(truth, rng))
+    marked = fit.stars['id'][fit.stars['reference'] == 'qso']
+    assert np.isin(marked, which).all()
+    assert len(marked) == 150
+    # The object far from the field is not one of the stars.
+    assert len(fit.stars) == 350
+    assert_allclose(rms(pulls(fit.stars, truth)[
+        :, ~truth.qso[fit.stars['id']]]), 1, atol=0.12)
+
+
+def test_a_given_floor_is_added_to_the_errors(rng):
+    truth = make_truth(rng, n_stars=100, n_qso=50, sigma=1.0)
+    epochs = observe(truth, rng, times=TIMES[[0, 6]], missing=0)
+    one, two = (ProperMotionFitter(transform=None, clip=None,
+                                   systematic=floor).fit(epochs).stars
+                for floor in (None, [np.sqrt(3)] * 2 * u.mas))
+    assert_allclose(two['pmra_error'] / one['pmra_error'], 2, rtol=1e-6)
+
+
+def test_times_of_single_rows_are_used(rng):
+    epochs, _ = plane_epochs(rng, error=1e-6)
+    fast = []
+    for epoch in epochs:
+        early = rng.uniform(-0.1, 0.1, 40)
+        moved = epoch.table['x_fit'] + 3.0 * early
+        table = changed(epoch, x_fit=moved,
+                        time=epoch.mean_year + early).table
+        fast.append(Epoch(table))
+    # All stars move by 3 pixels a year on top of what they did.
+    for k, epoch in enumerate(fast):
+        epoch.table['x_fit'] += 3.0 * (epochs[k].mean_year - 2020.0)
+    given, plain = (ProperMotionFitter(transform=None, clip=None,
+                                       systematic=None).fit(some).stars
+                    for some in (fast, epochs))
+    motion = np.median(given['pmra'].value - plain['pmra'].value)
+    assert_allclose(motion, 3.0, atol=0.02)
+
+
+def test_identifiers_of_other_stars_stop_the_fit(rng):
+    # The same numbers for different stars: nothing agrees.
+    epochs, _ = plane_epochs(rng, n=60, years=(2020.0, 2021.0, 2022.0))
+    mixed = [changed(epoch, id=rng.permutation(60)) for epoch in epochs]
+    with pytest.raises(ValueError, match='must agree on which star is which'):
+        ProperMotionFitter(transform='affine').fit(mixed)

@@ -87,7 +87,7 @@ def test_the_terms_of_two_groups_are_multiplied(tmp_path, rng):
                     np.tensordot(terms, planes, 1), rtol=1e-6)
     with pytest.raises(ValueError, match="value of 'MAG_AUTO'"):
         model.image_at(10, 20)
-    with pytest.raises(TypeError, match="among .* got \\['MAG'\\]"):
+    with pytest.raises(TypeError, match=r"among .* got \['MAG'\]"):
         model.image_at(10, 20, MAG_AUTO=18, MAG=3)
 
 

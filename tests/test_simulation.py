@@ -610,3 +610,14 @@ def test_every_exposure_needs_its_psf():
     with pytest.raises(ValueError, match='psfs must have one element'):
         simulate_epochs(sky_field(1, 0, rng=1), paper_exposures()[:2],
                         psfs=[None], rng=1)
+
+
+def test_the_header_is_the_wcs_with_any_cubic(rng):
+    cubic = np.add(*np.indices((4, 4))) <= 3
+    exposure = Exposure(ra=0.001, dec=-80.0, rotation=33.0, scale=0.999,
+                        distortion=rng.standard_normal((2, 4, 4)) * cubic)
+    x, y = rng.uniform(0, 700, (2, 100))
+    header = FITSWCS(exposure.fits_header((700, 800), 0.074))
+    expected = exposure.wcs((700, 800), 0.074)(x, y)
+    assert_allclose(header.all_pix2world(x, y, 0), expected, rtol=0,
+                    atol=1e-11)

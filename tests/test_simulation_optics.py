@@ -3,12 +3,13 @@ import numpy as np
 import pytest
 from astropy.nddata import NDData
 from astropy.table import QTable
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF
 from photutils_mgauss._brighter_fatter import photons
 from photutils_mgauss._simulation_brush import widen
+from photutils_mgauss._simulation_optics import _interpolation
 from photutils_mgauss.simulation import (
     DetectorEffects,
     Exposure,
@@ -90,6 +91,25 @@ def test_scenes_and_catalogues_take_images_of_psfs(uniform_psf):
     catalogue, = simulate_catalogues(sources, [Exposure()], rng=1,
                                      instrument=camera, psfs=[uniform_psf])
     assert 0.005 < catalogue.table['x_err'][0].value < 0.05
+
+
+def test_polynomials_through_chebyshev_points_give_polynomials_back():
+    places = np.polynomial.chebyshev.chebpts1(5)
+    nodes = np.linspace(-1, 1, 11)
+    share = _interpolation(places, nodes)
+    assert_allclose(share @ (places**4 - places), nodes**4 - nodes,
+                    atol=1e-12)
+    assert_allclose(_interpolation(nodes, nodes), np.eye(11), atol=1e-6)
+
+
+def test_interpolated_nodes_agree_with_drawn_ones():
+    pytest.importorskip('galsim')
+    optics = Optics((300, 300), wavefront=10, variation=5, n_wavelengths=1)
+    psf = optics.to_gridded_psf(5, n_samples=4, radius=8)
+    drawn = optics.to_gridded_psf(2, radius=8)
+    corners = psf.data.reshape(5, 5, 65, 65)[::4, ::4].reshape(4, 65, 65)
+    assert_allclose(corners, drawn.data, atol=0.01 * drawn.data.max())
+    assert_array_equal(np.asarray(psf.grid_xypos)[6], (74.75, 74.75))
 
 
 # Images of PSFs need no optics.

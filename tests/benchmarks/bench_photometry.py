@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -124,12 +125,12 @@ def compare_groups(rng):
     for n in (20, 40):
         image, start = _group(psf, n, rng)
         error = np.full(image.shape, 5.0)
+        call = {'error': error, 'init_params': start}
         tables, times = [], []
         for fitter in (None, MixtureFitter()):
             phot = PSFPhotometry(psf, (7, 7), fitter=fitter,
                                  group_warning_threshold=100)
-            wall, _, table = timed(lambda phot=phot: phot(
-                image, error=error, init_params=start), 1)
+            wall, _, table = timed(partial(phot, image, **call), 1)
             tables.append(table)
             times.append(wall)
         apart = np.abs(tables[0]['x_fit'] - tables[1]['x_fit']).max()
@@ -137,8 +138,7 @@ def compare_groups(rng):
               f'{times[1]:.3f} s, {times[0] / times[1]:.1f} times faster, '
               f'positions within {apart:.1e} pixels')
         ours = MixturePSFPhotometry(psf, (7, 7), group_warning_threshold=100)
-        wall, _, _ = timed(lambda ours=ours: ours(image, error=error,
-                                                  init_params=start))
+        wall, _, _ = timed(partial(ours, image, **call))
         print(f'             MixturePSFPhotometry {wall:.4f} s, '
               f'{times[0] / wall:.0f} times faster')
 
@@ -166,8 +166,8 @@ def time_sextractor(image, speed):
     if program is None or psfex is None:
         print('SExtractor or PSFEx is not installed: not compared')
         return
-    with tempfile.TemporaryDirectory() as folder:
-        folder = Path(folder)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
         fits.writeto(folder / 'image.fits', image.astype('f4'))
         first = ['X_IMAGE', 'Y_IMAGE', 'FLUX_RADIUS', 'SNR_WIN',
                  'FLUX_APER(1)', 'FLUXERR_APER(1)', 'ELONGATION', 'FLAGS',

@@ -1,0 +1,293 @@
+r"""
+The noise of pixels, and the best that any measurement can do with it.
+
+Eq. 10 of Nie et al. gives the variance of a pixel in electrons,
+
+.. math::
+
+    \sigma_i^2 = f_i + \sigma_\mathrm{RD}^2 + \sigma_\mathrm{sky}^2 ,
+
+with the light :math:`f_i` of the star. In the unit of an image that holds
+electrons times :math:`1 / c`, where c is the gain, the exposure time or their
+product, the same variance is
+:math:`f_i / c + (\sigma_\mathrm{RD}^2 + \sigma_\mathrm{sky}^2) / c^2`.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+from photutils.utils import calc_total_error
+
+from photutils_mgauss import _kernels
+from photutils_mgauss._star_fits import cut_boxes, psf_arrays
+from photutils_mgauss._validation import as_floats, as_real, as_shape
+
+__all__ = ['CramerRao', 'cramer_rao', 'pixel_error']
+
+
+def _electrons(gain, exposure_time):
+    """Return the electrons in one unit of the image."""
+    gain = as_real(gain, 'gain', above=0)
+    if exposure_time is None:
+        return gain
+    return gain * as_real(exposure_time, 'exposure_time', above=0)
+
+
+def background_error(*, sky=0, read_noise=0, gain=1, exposure_time=None):
+    """
+    Return the error of a pixel without stars, in the unit of the image.
+
+    Parameters
+    ----------
+    sky : float or array_like, optional
+        The level of the sky, in the unit of the image.
+    read_noise : float, optional
+        The noise of the readout [electron].
+    gain : float, optional
+        Electrons in a count; 1 for images in electrons.
+    exposure_time : float, optional
+        If given, the image is a rate and this is its exposure time [s].
+
+    Returns
+    -------
+    float or `~numpy.ndarray`
+        The standard deviation.
+
+    Examples
+    --------
+    >>> from photutils_mgauss.noise import background_error
+    >>> float(background_error(sky=96, read_noise=2))
+    10.0
+    """
+    electrons = _electrons(gain, exposure_time)
+    read_noise = as_real(read_noise, 'read_noise', minimum=0)
+    sky = as_floats(sky, 'sky')
+    if (sky < 0).any():
+        msg = f'sky must not be negative, got {sky.min()}'
+        raise ValueError(msg)
+    return np.sqrt(sky / electrons + (read_noise / electrons) ** 2)[()]
+
+
+def pixel_error(light, *, sky=0, read_noise=0, gain=1, exposure_time=None):
+    """
+    Return the errors of the pixels of an image (Eq. 10 of Nie et al.).
+
+    Parameters
+    ----------
+    light : (ny, nx) array_like
+        The light above the sky: the image itself, as in the paper, or a model
+        of it. Errors from the image are too small where noise made a pixel
+        faint, and weighted fluxes come out low; with a model they do not.
+        Negative light counts as none.
+    sky : float or (ny, nx) array_like, optional
+        The level of the sky, in the unit of the image.
+    read_noise : float, optional
+        The noise of the readout [electron].
+    gain : float, optional
+        Electrons in a count; 1 for images in electrons.
+    exposure_time : float, optional
+        If given, the image is a rate and this is its exposure time [s].
+
+    Returns
+    -------
+    (ny, nx) `~numpy.ndarray`
+        Standard deviations in the unit of the image, by
+        `photutils.utils.calc_total_error`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not a number, or out of range.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import pixel_error
+    >>> pixel_error([[0.0, 300.0]], sky=96, read_noise=2)
+    array([[10., 20.]])
+    >>> pixel_error([[0.0, 3.0]], sky=0.96, read_noise=2, exposure_time=100)
+    array([[0.1, 0.2]])
+    """
+    light = as_floats(light, 'light', finite=False)
+    background = background_error(sky=sky, read_noise=read_noise, gain=gain,
+                                  exposure_time=exposure_time)
+    background = np.broadcast_to(background, light.shape)
+    return calc_total_error(light, background,
+                            _electrons(gain, exposure_time))
+
+
+@dataclass(frozen=True, eq=False)
+class CramerRao:
+    """
+    The smallest errors that an unbiased measurement of stars can have.
+
+    Attributes
+    ----------
+    x_err, y_err : (n,) `~numpy.ndarray`
+        Of the positions [pix].
+    flux_err : (n,) `~numpy.ndarray`
+        Of the fluxes, in their unit.
+    covariance : (n, 3, 3) `~numpy.ndarray`
+        Of flux, x and y of each star.
+    """
+
+    covariance: np.ndarray
+
+    @property
+    def flux_err(self):
+        return np.sqrt(self.covariance[:, 0, 0])
+
+    @property
+    def x_err(self):
+        return np.sqrt(self.covariance[:, 1, 1])
+
+    @property
+    def y_err(self):
+        return np.sqrt(self.covariance[:, 2, 2])
+
+
+def cramer_rao(psf, flux, sky=0, *, x=0, y=0, read_noise=0, gain=1,
+               exposure_time=None, fit_shape=15, free_sky=False,
+               jointly=False):
+    r"""
+    Forecast the errors of positions and fluxes.
+
+    The Cramer-Rao bound is the inverse of the Fisher matrix
+
+    .. math::
+
+        I_{ab} = \sum_i \frac{1}{\sigma_i^2}
+        \frac{\partial m_i}{\partial a} \frac{\partial m_i}{\partial b}
+
+    with the variance of Eq. 10 of Nie et al. at the true model m.
+
+    Parameters
+    ----------
+    psf : GaussianMixture, GriddedMixturePSF or MultiGaussianPSFModel
+        The PSF. A mixture is taken to contain the pixel.
+    flux : (n,) array_like
+        The total fluxes, in the unit of the image.
+    sky : float, optional
+        The level of the sky, in the unit of the image.
+    x, y : (n,) array_like, optional
+        The positions [pix].
+    read_noise : float, optional
+        The noise of the readout [electron].
+    gain : float, optional
+        Electrons in a count; 1 for images in electrons.
+    exposure_time : float, optional
+        If given, the image is a rate and this is its exposure time [s].
+    fit_shape : int or (ny, nx) tuple of int, optional
+        The pixels used of each star.
+    free_sky : bool, optional
+        Whether the sky of each star (of all, if ``jointly``) is fitted, too.
+    jointly : bool, optional
+        Whether all stars are in one image and fitted together, each pixel
+        used once: the bound with neighbours. By default each is alone.
+
+    Returns
+    -------
+    CramerRao
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not valid.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import GaussianMixture, cramer_rao
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[1, 0], [0, 1]]])
+    >>> bound = cramer_rao(psf, [1e4, 1e6])
+    >>> bound.x_err
+    array([0.01 , 0.001])
+    """
+    flux, x, y = (np.atleast_1d(a).astype(float) for a in
+                  np.broadcast_arrays(as_floats(flux, 'flux'),
+                                      as_floats(x, 'x'), as_floats(y, 'y')))
+    level = background_error(sky=as_real(sky, 'sky', minimum=0),
+                             read_noise=read_noise, gain=gain,
+                             exposure_time=exposure_time)
+    noise = level**2, _electrons(gain, exposure_time)
+    jets = _Jets(psf, x, y, as_shape(fit_shape, 'fit_shape'))
+    if jointly:
+        return CramerRao(_joint_bound(jets, flux, noise, free_sky))
+    return CramerRao(np.array([
+        _bound(jets.own(i), flux[i], noise, free_sky)
+        for i in range(x.size)]))
+
+
+class _Jets:
+    """The PSF and its derivatives by position in the pixels of each star."""
+
+    def __init__(self, psf, x, y, fit_shape):
+        self.x, self.y = x, y
+        self.psf = _jet_arrays(psf)
+        huge = (np.iinfo(np.int32).max, np.iinfo(np.int32).max)
+        self.corner = np.floor([x.min(), y.min()]) - max(fit_shape)
+        self.boxes = cut_boxes(x - self.corner[0], y - self.corner[1],
+                               fit_shape, huge)
+        self.boxes[:, 0] += int(self.corner[1])
+        self.boxes[:, 1] += int(self.corner[0])
+
+    def star(self, i, box):
+        """Return the jet (3, pixels) of star i in a box."""
+        out = np.empty((3, box[2] * box[3]))
+        _kernels.star_jet(self.x[i], self.y[i], box, self.psf, out)
+        return out
+
+    def own(self, i):
+        return self.star(i, self.boxes[i])
+
+
+def _jet_arrays(psf):
+    from photutils_mgauss.mixture import GaussianMixture
+    from photutils_mgauss.model import MultiGaussianPSFModel
+    if isinstance(psf, GaussianMixture):
+        psf = MultiGaussianPSFModel(psf)
+    if hasattr(psf, 'to_grid'):
+        psf = psf.to_grid()
+    return psf_arrays(psf)
+
+
+def _bound(jet, flux, noise, free_sky):
+    """Return the covariance (3, 3) of one star by itself."""
+    columns = [jet[0], flux * jet[1], flux * jet[2]]
+    if free_sky:
+        columns.append(np.ones(jet.shape[1]))
+    columns = np.array(columns)
+    variance = noise[0] + np.maximum(flux * jet[0], 0) / noise[1]
+    return _inverse_blocks((columns / variance) @ columns.T, 1)[0]
+
+
+def _joint_bound(jets, flux, noise, free_sky):
+    """Return the covariances (n, 3, 3) of stars that share pixels."""
+    n = flux.size
+    size = 3 * n + bool(free_sky)
+    fisher = np.zeros((size, size))
+    seen = set()
+    for box in jets.boxes:
+        pixels = [(row, column)
+                  for column in range(box[1], box[1] + box[3])
+                  for row in range(box[0], box[0] + box[2])]
+        new = np.array([pixel not in seen for pixel in pixels])
+        seen.update(pixels)
+        if not new.any():
+            continue
+        jet = np.array([jets.star(i, box)[:, new] for i in range(n)])
+        jet[:, 1:] *= flux[:, None, None]
+        variance = noise[0] + np.maximum(
+            flux @ jet[:, 0], 0) / noise[1]
+        columns = jet.reshape(3 * n, -1)
+        if free_sky:
+            columns = np.vstack([columns, np.ones(columns.shape[1])])
+        fisher += (columns / variance) @ columns.T
+    return _inverse_blocks(fisher, n)
+
+
+def _inverse_blocks(fisher, n):
+    """Return the first n diagonal (3, 3) blocks of the inverse matrix."""
+    scale = np.sqrt(np.diag(fisher))
+    scale = np.where(scale > 0, scale, 1)
+    inverse = np.linalg.inv(fisher / np.outer(scale, scale))
+    inverse /= np.outer(scale, scale)
+    return np.array([inverse[3 * i:3 * i + 3, 3 * i:3 * i + 3]
+                     for i in range(n)])
