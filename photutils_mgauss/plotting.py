@@ -26,6 +26,13 @@ __all__ = [
 ]
 
 BLUE, ORANGE, GREEN, BLACK = '#0072B2', '#E69F00', '#009E73', '#000000'
+_CYCLE = (BLUE, ORANGE, GREEN, '#CC79A7', '#D55E00', '#56B4E9', '#F0E442')
+_NODE_LABELS = {
+    'size_error': r'$\delta(R^2)/R^2$',
+    'ellipticity_error': r'$\delta\epsilon$',
+    'phase_error': 'pixel-phase error [pix]',
+    'enclosed_flux': 'enclosed flux',
+}
 
 
 def plot_error_curve(ax, magnitude, residuals, errors, *, unit, n_bins=6):
