@@ -22,6 +22,7 @@ except ImportError:  # a source tree that was never installed
 
 # Public name -> the module that owns it.
 _OWNERS = {
+    'EmpiricalPSF': 'empirical',
     'GriddedMixturePSF': 'gridded',
     'PSFAssessment': 'assessment',
     'assess_psf': 'assessment',
