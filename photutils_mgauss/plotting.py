@@ -10,25 +10,29 @@ from photutils_mgauss.shapes import adaptive_moments
 
 __all__ = [
     'plot_comparison',
-    'plot_error_curve',
-    'plot_node_map',
-    'plot_whiskers',
-    'plot_worst_node',
-__all__ = [
-    'plot_comparison',
     'plot_comparison_of_numbers',
     'plot_ellipses',
     'plot_error_curve',
     'plot_model_graph',
+    'plot_node_map',
     'plot_posterior',
     'plot_profile',
     'plot_projection',
     'plot_residual',
     'plot_shape_map',
     'plot_trace',
+    'plot_whiskers',
+    'plot_worst_node',
 ]
 
 BLUE, ORANGE, GREEN, BLACK = '#0072B2', '#E69F00', '#009E73', '#000000'
+_CYCLE = (BLUE, ORANGE, GREEN, '#CC79A7', '#D55E00', '#56B4E9', '#F0E442')
+_NODE_LABELS = {
+    'size_error': r'$\delta(R^2)/R^2$',
+    'ellipticity_error': r'$\delta\epsilon$',
+    'phase_error': 'pixel-phase error [pix]',
+    'enclosed_flux': 'enclosed flux',
+}
 
 
 def plot_error_curve(ax, magnitude, residuals, errors, *, unit, n_bins=6):
@@ -99,27 +103,9 @@ def plot_comparison(ax, true, measured, errors, *, label, unit):
     return ax
 
 
-# Grids of mixtures over a detector or a focal plane.
-
-_NODE_LABELS = {
-    'size_error': r'$\delta(R^2)/R^2$',
-    'ellipticity_error': r'$\delta\epsilon$',
-    'phase_error': 'pixel-phase error [pix]',
-    'enclosed_flux': 'enclosed flux',
-}
-
-
 def plot_node_map(ax, psf, column='size_error', *, layout=None):
     r"""
     Map a column of the nodes' report (as Figs. 4-7 of Nie et al.).
-# Figures of mixtures: fits, their Gaussians, posteriors.
-
-_CYCLE = (BLUE, ORANGE, GREEN, '#CC79A7', '#D55E00', '#56B4E9', '#F0E442')
-
-
-def plot_projection(ax, fit, image, *, axis='x', oversampling=1):
-    """
-    Plot an image, its fit and each Gaussian summed along one axis (Fig. 3a).
 
     Parameters
     ----------
@@ -181,14 +167,6 @@ def plot_whiskers(ax, psf, *, layout=None, scale=None):
     scale : float, optional
         The length of a whisker of ellipticity 1 [pix]; by default the largest
         whisker is as long as half the distance of two nodes.
-    fit : MixtureFit
-        The fit.
-    image : (ny, nx) array_like
-        The image that was fitted.
-    axis : {'x', 'y'}, optional
-        The axis that stays.
-    oversampling : int or (y, x) tuple of int, optional
-        Image pixels per native pixel.
 
     Returns
     -------
@@ -217,38 +195,6 @@ def plot_whiskers(ax, psf, *, layout=None, scale=None):
 def plot_worst_node(ax, psf, source, column='size_error'):
     """
     Show the residual of the node with the largest error.
-    image = np.asarray(image, float)
-    step = np.broadcast_to(oversampling, 2)[::-1][0 if axis == 'x' else 1]
-    along = 0 if axis == 'x' else 1
-    data = image.sum(axis=along)
-    position = (np.arange(data.size) - (data.size - 1) / 2) / step
-    fine = np.linspace(position[0], position[-1], 10 * data.size)
-    across = np.broadcast_to(oversampling, 2)[::-1][1 if axis == 'x' else 0]
-    i = 0 if axis == 'x' else 1
-    total = np.zeros_like(fine)
-    mixture = fit.mixture
-    for k in range(mixture.n_components):
-        stddev = mixture.stddevs[k, i]
-        curve = (fit.flux * across * mixture.weights[k]
-                 / (np.sqrt(2 * np.pi) * stddev)
-                 * np.exp(-0.5 * ((fine - mixture.means[k, i]) / stddev)**2))
-        total += curve
-        ax.plot(fine, curve, color=_CYCLE[k % len(_CYCLE)],
-                label=f'{mixture.weights[k]:.1%}')
-    ax.plot(fine, total, color=_CYCLE[4], linewidth=2.5, alpha=0.6,
-            label='mixture')
-    ax.plot(position, data, '.', color=BLACK, label='image')
-    ax.set(xlabel=f'{axis} [pix]', ylabel='projected flux density')
-    ax.legend()
-    return ax
-
-
-def plot_profile(ax, fit, image):
-    """
-    Plot the brightest row of image, model and residual in logarithms.
-
-    As Fig. 3b. Pixels that are not positive have no logarithm and are left
-    out.
 
     Parameters
     ----------
@@ -260,10 +206,6 @@ def plot_profile(ax, fit, image):
         The ePSFs it was made of.
     column : str, optional
         The column of ``report`` that is the error.
-    fit : MixtureFit
-        The fit.
-    image : (ny, nx) array_like
-        The image that was fitted.
 
     Returns
     -------
@@ -330,6 +272,75 @@ def _focal_plane(ax, psfs, places):
             ax.annotate(name, (low + high) / 2, ha='center', va='center')
     ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal')
     return ax
+
+
+def plot_projection(ax, fit, image, *, axis='x', oversampling=1):
+    """
+    Plot an image, its fit and each Gaussian summed along one axis (Fig. 3a).
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Where to draw.
+    fit : MixtureFit
+        The fit.
+    image : (ny, nx) array_like
+        The image that was fitted.
+    axis : {'x', 'y'}, optional
+        The axis that stays.
+    oversampling : int or (y, x) tuple of int, optional
+        Image pixels per native pixel.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        The same.
+    """
+    image = np.asarray(image, float)
+    step = np.broadcast_to(oversampling, 2)[::-1][0 if axis == 'x' else 1]
+    along = 0 if axis == 'x' else 1
+    data = image.sum(axis=along)
+    position = (np.arange(data.size) - (data.size - 1) / 2) / step
+    fine = np.linspace(position[0], position[-1], 10 * data.size)
+    across = np.broadcast_to(oversampling, 2)[::-1][1 if axis == 'x' else 0]
+    i = 0 if axis == 'x' else 1
+    total = np.zeros_like(fine)
+    mixture = fit.mixture
+    for k in range(mixture.n_components):
+        stddev = mixture.stddevs[k, i]
+        curve = (fit.flux * across * mixture.weights[k]
+                 / (np.sqrt(2 * np.pi) * stddev)
+                 * np.exp(-0.5 * ((fine - mixture.means[k, i]) / stddev)**2))
+        total += curve
+        ax.plot(fine, curve, color=_CYCLE[k % len(_CYCLE)],
+                label=f'{mixture.weights[k]:.1%}')
+    ax.plot(fine, total, color=_CYCLE[4], linewidth=2.5, alpha=0.6,
+            label='mixture')
+    ax.plot(position, data, '.', color=BLACK, label='image')
+    ax.set(xlabel=f'{axis} [pix]', ylabel='projected flux density')
+    ax.legend()
+    return ax
+
+
+def plot_profile(ax, fit, image):
+    """
+    Plot the brightest row of image, model and residual in logarithms.
+
+    As Fig. 3b. Pixels that are not positive have no logarithm and are left
+    out.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Where to draw.
+    fit : MixtureFit
+        The fit.
+    image : (ny, nx) array_like
+        The image that was fitted.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
         The same.
     """
     image = np.asarray(image, float)
