@@ -59,7 +59,8 @@ def literal(image, k, start, arguments):
             chains=arguments.chains, random_seed=arguments.seed,
             progressbar=False, cores=arguments.cores,
             compute_convergence_checks=False,
-            initvals=first if arguments.start else None)
+            initvals=first if arguments.start else None,
+            init='adapt_diag' if arguments.start else 'auto')
     draws = [np.asarray(idata['posterior'][name].values) for name in NAMES]
     draws[1] = (draws[1] - middle) / PIXEL_SCALE
     draws[2] = draws[2] / PIXEL_SCALE
@@ -99,7 +100,8 @@ def main():
     parser.add_argument('--cores', type=int, default=2)
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--start', action='store_true',
-                        help='start the literal model at least squares too')
+                        help='start the literal model at least squares too, '
+                        'else its chains find other modes')
     arguments = parser.parse_args()
     if arguments.stamps:
         with np.load(arguments.stamps) as file:
