@@ -22,6 +22,8 @@ except ImportError:  # a source tree that was never installed
 
 # Public name -> the module that owns it.
 _OWNERS = {
+    'CrowdedMixturePhotometry': 'crowded',
+    'UnfinishedTilesError': 'crowded',
     'GriddedMixturePSF': 'gridded',
     'MultiGaussianPSFModel': 'model',
     'GaussianMixture': 'mixture',

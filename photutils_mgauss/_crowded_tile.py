@@ -1,0 +1,516 @@
+r"""
+One tile of a crowded image: every star and the background, together.
+
+The image is modelled as stars of unknown positions and fluxes on a bilinear
+background,
+
+.. math::
+
+    M(\mathbf{r}) = b(\mathbf{r}) + \sum_i f_i\,
+    P(\mathbf{r} - \mathbf{r}_i\,|\,\mathbf{r}_i),
+
+and Gauss-Newton steps for all of its parameters at once come from their joint
+normal equations, sparse because a star overlaps only its neighbours.
+Positions here are tile pixels.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import label, maximum_filter
+from scipy.spatial import cKDTree
+
+from photutils_mgauss import _kernels
+from photutils_mgauss._local_psf import MAX_WING, cells
+
+# Fit stamps are 7 or 9 pixels wide, 13 for bright stars: almost all of the
+# information on a position lies in the core.
+_MIN_HALF, _MAX_HALF, _BRIGHT_HALF = 3, 4, 6
+# In units of noise over the PSF's peak.
+_BRIGHT_FLUX = 300
+# A star is drawn out to where its surface brightness falls below this
+# fraction of the noise.
+_WING_NOISE = 0.1
+# Stars further apart than this are not solved for together [pix]; they still
+# see each other through the residual.
+_PAIR_DISTANCE = 5.0
+# A step of Gauss-Newton moves a star no further than this [pix].
+_MAX_MOVE = 0.4
+_CG_STEPS = 60
+# The PSF of a cell of this many pixels serves for finding.
+_CELL = 64
+_TEMPLATE_HALF = 3
+# Pixels where nine together stand out less than this fraction of the
+# threshold are not looked at.
+_HINT = 0.4
+# A further star is looked for within this distance of a known one [pix], with
+# the known one free to move; where less than this fraction of the
+# information is left, the two cannot be told apart.
+_REACH = 2.3
+_LEAST = 0.05
+# No star is added this close to another, or to one that was taken away [pix].
+_SEPARATION = 0.3
+_GRAVE = 0.5
+# Finding starts with the brightest stars.
+_FALLING = (80, 25, 10)
+_FINAL_STEPS = 8
+_CONVERGED = 2e-4
+# Pixels further than this from the model take no part in the background.
+_BACKGROUND_CLIP = 4.0
+# Groups of bad pixels of up to this many may hide a saturated star.
+_SATURATED_PIXELS = (2, 2000)
+
+
+@dataclass(frozen=True)
+class TileOptions:
+    """What all tiles share."""
+
+    threshold: float
+    keep: float
+    background_size: float | None
+    psf_error: float
+    gain: float | None
+    floor: float
+    max_rounds: int
+
+
+@dataclass(frozen=True)
+class TileJob:
+    """
+    A piece of an image, with its margin.
+
+    ``origin`` (y, x) is where its first pixel is in the image, ``core``
+    (y_low, y_high, x_low, x_high) the part, in image pixels, whose stars
+    this tile is to report.
+    """
+
+    data: np.ndarray
+    variance: np.ndarray
+    psf: object
+    options: TileOptions
+    origin: tuple
+    core: tuple
+    given: np.ndarray | None = None
+
+
+class Stars:
+    """The stars of a tile, as parallel arrays."""
+
+    COLUMNS = ('x', 'y', 'flux', 'x_init', 'y_init', 'flux_init',
+               'significance', 'round', 'number', 'seeded')
+
+    def __init__(self, x, y, flux, *, significance=0, found_in=0, number=-1,
+                 seeded=False):
+        n = len(x)
+        self.x, self.y, self.flux = (np.array(v, float) for v in (x, y, flux))
+        self.x_init, self.y_init = self.x.copy(), self.y.copy()
+        self.flux_init = self.flux.copy()
+        self.significance = np.zeros(n) + significance
+        self.round = np.zeros(n, int) + found_in
+        self.number = np.zeros(n, int) + number
+        self.seeded = np.zeros(n, bool) | seeded
+
+    def __len__(self):
+        return self.x.size
+
+    def select(self, chosen):
+        """Keep the chosen stars only."""
+        for name in self.COLUMNS:
+            setattr(self, name, getattr(self, name)[chosen])
+
+    def append(self, other):
+        """Add stars."""
+        for name in self.COLUMNS:
+            setattr(self, name, np.concatenate([getattr(self, name),
+                                                getattr(other, name)]))
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """
+    Who overlaps whom: rows of a sparse matrix, nearest first.
+
+    Star i's neighbours are neighbour[indptr[i]:indptr[i + 1]], twin is where
+    the same pair stands the other way round; owner is i for each of them.
+    """
+
+    indptr: np.ndarray
+    neighbour: np.ndarray
+    twin: np.ndarray
+    owner: np.ndarray
+    nearest: np.ndarray
+    distance: np.ndarray
+
+    @classmethod
+    def of(cls, x, y):
+        """List the pairs of stars that are solved for together."""
+        n = x.size
+        pairs = np.empty((0, 2), int)
+        if n > 1:
+            pairs = cKDTree(np.column_stack([x, y])).query_pairs(
+                _PAIR_DISTANCE, output_type='ndarray')
+        i = np.concatenate([pairs[:, 0], pairs[:, 1]])
+        j = np.concatenate([pairs[:, 1], pairs[:, 0]])
+        gap = np.hypot(x[i] - x[j], y[i] - y[j])
+        order = np.lexsort((j, gap, i))
+        place = np.empty(i.size, np.int64)
+        place[order] = np.arange(i.size)
+        twin = place[np.roll(np.arange(i.size), len(pairs))][order]
+        i, j, gap = i[order], j[order], gap[order]
+        indptr = np.searchsorted(i, np.arange(n + 1))
+        has = indptr[1:] > indptr[:-1]
+        nearest, distance = np.full(n, -1), np.full(n, np.inf)
+        nearest[has] = j[indptr[:-1][has]]
+        distance[has] = gap[indptr[:-1][has]]
+        return cls(indptr.astype(np.int64), j.astype(np.int64), twin, i,
+                   nearest, distance)
+
+
+class Tile:
+    """The state of a tile while it is being solved."""
+
+    def __init__(self, job):
+        self.data = job.data
+        self.variance = job.variance
+        self.good = job.variance > 0
+        self.psf = job.psf
+        self.options = job.options
+        self.origin = job.origin
+        self.stars = Stars([], [], [])
+        self.graves = np.empty((0, 2))
+        self.weight = np.divide(1, self.variance, where=self.good,
+                                out=np.zeros(self.data.shape))
+        self.noise = 1 / np.sqrt(np.median(self.weight[self.good]))
+        ny, nx = self.data.shape
+        self.profile = self.psf.profile(nx / 2, ny / 2)
+        self._make_mesh()
+        self._make_templates()
+
+    def _make_mesh(self):
+        ny, nx = self.data.shape
+        size = self.options.background_size or max(ny, nx)
+        y_0, x_0 = self.origin
+        self.mesh_x = _lattice(x_0, nx, size) - x_0
+        self.mesh_y = _lattice(y_0, ny, size) - y_0
+        start = 0.0
+        if self.options.background_size:
+            # Stars hide the sky.
+            start = np.percentile(self.data[self.good], 20)
+        self.level = np.full(self.mesh_x.size * self.mesh_y.size, start)
+
+    def _make_templates(self):
+        ny, nx = self.data.shape
+        rows, columns = range(0, ny, _CELL), range(0, nx, _CELL)
+        self.templates = np.array([[
+            self.psf.stamp((x + min(x + _CELL, nx)) // 2,
+                           (y + min(y + _CELL, ny)) // 2, _TEMPLATE_HALF)
+            for x in columns] for y in rows])
+
+    # The model.
+
+    def lay_out(self):
+        """Choose stamps and wings, list neighbours."""
+        s = self.stars
+        flux = np.maximum(s.flux, 1e-300)
+        self.wing = np.clip(
+            np.searchsorted(-self.profile, -_WING_NOISE * self.noise / flux),
+            _MIN_HALF, MAX_WING).astype(np.int64)
+        bright = s.flux * self.profile[0] > _BRIGHT_FLUX * self.noise
+        half = np.clip(self.wing, _MIN_HALF, np.where(
+            bright, _BRIGHT_HALF, _MAX_HALF))
+        half[s.seeded] = _BRIGHT_HALF + 2
+        self.wing = np.maximum(self.wing, half)
+        self.width = 2 * half + 1
+        self.left = np.rint(s.x).astype(np.int64) - half
+        self.bottom = np.rint(s.y).astype(np.int64) - half
+        ends = np.cumsum(self.width**2)
+        self.offset = np.concatenate([[0], ends])[:-1].astype(np.int64)
+        self.jets = np.empty((3, self.width @ self.width))
+        self.pairs = Neighbours.of(s.x, s.y)
+
+    def _place(self):
+        return self.left, self.bottom, self.width, self.offset
+
+    def draw(self):
+        """Evaluate all stamps, the residual and the weights."""
+        s = self.stars
+        everyone = np.arange(len(s))
+        psf = (*self.psf.rows_at(s.x, s.y), self.psf.integrated)
+        _kernels.star_stamps(everyone, s.x, s.y, *self._place(), *psf,
+                             self.jets)
+        self.residual = self.data.copy()
+        _kernels.add_background(self.level, self.mesh_x, self.mesh_y, -1.0,
+                                self.residual)
+        _kernels.add_stars(everyone, -1.0, s.x, s.y, s.flux, *self._place(),
+                           self.wing, self.jets, *psf, self.residual)
+        if self.options.gain is not None:
+            # The photon noise of the model, not that of the data.
+            variance = self.variance - self.residual / self.options.gain
+            variance = np.maximum(variance, self.options.floor)
+            np.divide(1, variance, where=self.good, out=self.weight)
+
+    def star_light(self):
+        """Return the image of the stars alone."""
+        image = self.data - self.residual
+        _kernels.add_background(self.level, self.mesh_x, self.mesh_y, -1.0,
+                                image)
+        return image
+
+    # The joint fit.
+
+    def form_equations(self):
+        """Form the joint normal equations of stars and background."""
+        s, p = self.stars, self.pairs
+        n, m = len(s), self.level.size
+        self.matrix = np.empty((n, 3, 3))
+        self.gradient, self.reach = np.empty((n, 3)), np.empty((n, 3))
+        self.blocks = np.empty((p.neighbour.size, 3, 3))
+        self.mesh, self.mesh_gradient = np.zeros((m, m)), np.zeros(m)
+        place = (*self._place(), self.jets)
+        _kernels.star_equations(s.flux, *place, self.weight, self.residual,
+                                self.matrix, self.gradient, self.reach)
+        _kernels.pair_blocks(p.indptr, p.neighbour, p.twin, s.flux, *place,
+                             self.weight, self.blocks)
+        if self.options.background_size:
+            _kernels.background_equations(
+                self.residual, self.weight, self.mesh_x, self.mesh_y,
+                _BACKGROUND_CLIP, self.mesh, self.mesh_gradient)
+        else:
+            self.reach[:] = 0
+        # Nodes without data stay where they are.
+        self.mesh[np.diag_indices(m)] += 1e-6 / self.noise**2
+
+    def refresh(self):
+        """Bring everything up to date with the stars."""
+        self.lay_out()
+        self.draw()
+        self.form_equations()
+
+    def step(self, tolerance, damping=0.0):
+        """Take one Gauss-Newton step; return how far each star moved."""
+        s, p = self.stars, self.pairs
+        step = np.empty((len(s), 3))
+        level_step = np.empty(self.level.size)
+        matrix = self.matrix * (1 + damping * np.eye(3))
+        _kernels.solve_joint(
+            matrix, self.gradient, p.indptr, p.neighbour, self.blocks,
+            *self._shares(), self.reach, self.mesh, self.mesh_gradient,
+            tolerance, _CG_STEPS, step, level_step)
+        move = np.clip(step[:, 1:], -_MAX_MOVE, _MAX_MOVE)
+        s.x = s.x + move[:, 0]
+        s.y = s.y + move[:, 1]
+        s.flux = np.maximum(s.flux + step[:, 0], 0.2 * s.flux)
+        self.level = self.level + level_step
+        self.refresh()
+        return np.abs(move).max(axis=1, initial=0)
+
+    def _shares(self):
+        """Return each star's four nodes of the background and shares."""
+        s, n = self.stars, self.mesh_x.size
+        column, fx = cells(s.x, self.mesh_x)
+        row, fy = cells(s.y, self.mesh_y)
+        node = (row * n + column)[:, None] + np.array([0, 1, n, n + 1])
+        share = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy,
+                          fx * fy], axis=1)
+        return node, share
+
+    def covariances(self):
+        """Return covariances with neighbours free, and correlations."""
+        p = self.pairs
+        covariance = np.empty((len(self.stars), 3, 3))
+        correlation = np.empty(len(self.stars))
+        _kernels.joint_covariances(self.matrix, p.indptr, p.neighbour,
+                                   self.blocks, p.nearest, covariance,
+                                   correlation)
+        return covariance, correlation
+
+    # Finding and leaving out.
+
+    def find(self, threshold, found_in):
+        """Add the maxima of significance on the residual; return how many."""
+        significance, flux = self._scores(threshold)
+        peak = (significance > threshold) & (
+            significance == maximum_filter(significance, 3))
+        y, x = np.nonzero(peak)
+        dx, dy = _vertex(significance, x, y)
+        found = Stars(x + dx, y + dy, flux[y, x],
+                      significance=significance[y, x], found_in=found_in)
+        found.select(self._apart(found))
+        self.stars.append(found)
+        return len(found)
+
+    def _scores(self, threshold):
+        ny, nx = self.data.shape
+        significance = np.zeros((ny, nx))
+        flux = np.zeros((ny, nx))
+        light = self.options.psf_error * np.maximum(self.star_light(), 0)
+        weight = np.divide(self.weight, 1 + self.weight * light**2)
+        for j, i in np.ndindex(self.templates.shape[:2]):
+            _kernels.score(
+                self.residual, weight, self.templates[j, i], i * _CELL,
+                min((i + 1) * _CELL, nx), j * _CELL, min((j + 1) * _CELL, ny),
+                _HINT * threshold, significance, flux)
+        s, p = self.stars, self.pairs
+        _kernels.score_beside(
+            s.x, s.y, s.flux, *self._place(), self.jets, self.matrix,
+            self.gradient, p.indptr, p.neighbour, self.blocks, self.templates,
+            _CELL, self.weight, self.residual, light, _REACH, _LEAST,
+            threshold, significance, flux)
+        return significance, flux
+
+    def _apart(self, found):
+        apart = np.ones(len(found), bool)
+        positions = np.column_stack([found.x, found.y])
+        stars = np.column_stack([self.stars.x, self.stars.y])
+        for places, limit in ((stars, _SEPARATION), (self.graves, _GRAVE)):
+            if len(places) and len(found):
+                apart &= cKDTree(places).query(positions)[0] > limit
+        return apart
+
+    def leave_out(self, threshold):
+        """Remove the weakest of each clump of insignificant stars."""
+        s, p = self.stars, self.pairs
+        covariance, _ = self.covariances()
+        with np.errstate(invalid='ignore'):
+            strength = s.flux / np.sqrt(covariance[:, 0, 0])
+        weak = ~(strength >= threshold)
+        near = np.hypot(s.x[p.owner] - s.x[p.neighbour],
+                        s.y[p.owner] - s.y[p.neighbour]) < 2
+        rival = (near & weak[p.neighbour]
+                 & (s.flux[p.neighbour] < s.flux[p.owner]))
+        weak[p.owner[rival]] = False
+        ny, nx = self.data.shape
+        weak |= (s.x < -1) | (s.y < -1) | (s.x > nx) | (s.y > ny)
+        gone = np.flatnonzero(weak)
+        places = np.column_stack([s.x[gone], s.y[gone]])
+        s.select(~weak)
+        return places
+
+    def seed_saturated(self):
+        """Put a star on each clump of bad pixels that has a star's wings."""
+        clumps, n = label(~self.good)
+        if n == 0:
+            return
+        size = np.bincount(clumps.ravel())[1:]
+        low, high = _SATURATED_PIXELS
+        found = [self._wing_star(clumps, k + 1)
+                 for k in np.flatnonzero((size >= low) & (size <= high))]
+        found = [star for star in found if star is not None]
+        if found:
+            x, y, flux, significance = np.array(found).T
+            self.stars.append(Stars(x, y, flux, significance=significance,
+                                    seeded=True))
+
+    def _wing_star(self, clumps, k):
+        y, x = np.nonzero(clumps == k)
+        column, row = round(x.mean()), round(y.mean())
+        half = int(max(np.ptp(x), np.ptp(y)) / 2) + 6
+        ny, nx = self.data.shape
+        part = (slice(max(0, row - half), min(ny, row + half + 1)),
+                slice(max(0, column - half), min(nx, column + half + 1)))
+        stamp = self.psf.stamp(column, row, half)[
+            part[0].start - row + half:part[0].stop - row + half,
+            part[1].start - column + half:part[1].stop - column + half]
+        w = self.weight[part]
+        info = (w * stamp**2).sum()
+        if info == 0:
+            return None
+        # The faintest wing pixels say how bright the star can be: others may
+        # hold neighbours.
+        seen = (w > 0) & (stamp > 0.002 * stamp.max())
+        if seen.sum() < 8:
+            return None
+        ratio = (self.data[part] - self.level[0])[seen] / stamp[seen]
+        flux = np.median(ratio)
+        significance = flux * np.sqrt(info)
+        if significance < 10 * self.options.threshold:
+            return None
+        return x.mean(), y.mean(), flux, significance
+
+
+def solve_tile(job):
+    """
+    Find and fit the stars of a tile.
+
+    Parameters
+    ----------
+    job : TileJob
+
+    Returns
+    -------
+    Tile
+        Solved, its equations those of the solution, with ``moved`` (n,), how
+        far each star went in the last step.
+    """
+    tile = Tile(job)
+    if job.given is not None:
+        x, y, flux, number = job.given
+        tile.stars = Stars(x, y, flux, number=number.astype(int))
+        tile.refresh()
+        _warm_up(tile)
+    else:
+        tile.seed_saturated()
+        tile.refresh()
+        _find_all(tile)
+    _settle(tile)
+    return tile
+
+
+def _warm_up(tile):
+    for damping in (1.0, 0.3, 0.1, 0.03):
+        tile.step(1e-2, damping)
+
+
+def _find_all(tile):
+    options = tile.options
+    for number, threshold in enumerate(_FALLING):
+        if threshold > options.threshold and tile.find(threshold, number):
+            tile.refresh()
+            tile.step(1e-2, 0.05)
+            tile.leave_out(1.0)
+            tile.refresh()
+    for number in range(options.max_rounds):
+        new = tile.find(options.threshold, len(_FALLING) + number)
+        if new:
+            tile.refresh()
+            tile.step(1e-2, 0.05)
+            tile.step(1e-2, 0.01)
+        if number > 1:
+            gone = tile.leave_out(options.keep)
+            tile.graves = np.concatenate([tile.graves, gone])
+        else:
+            gone = tile.leave_out(0.7 * options.keep)
+        tile.refresh()
+        if new <= 0.003 * len(tile.stars):
+            break
+
+
+def _settle(tile):
+    tile.moved = np.zeros(len(tile.stars))
+    for _ in range(_FINAL_STEPS):
+        tile.moved = tile.step(1e-3)
+        if np.percentile(tile.moved, 99.5) < _CONVERGED if len(
+                tile.moved) else True:
+            break
+
+
+def _lattice(first, size, spacing):
+    """Return the multiples of spacing whose cells cover the pixels."""
+    low = np.floor(first / spacing)
+    high = max(np.ceil((first + size - 1) / spacing), low + 1)
+    return np.arange(low, high + 1) * float(spacing)
+
+
+def _vertex(image, x, y):
+    """Return the offsets of the tops of parabolas through three pixels."""
+    ny, nx = image.shape
+    out = []
+    for step_x, step_y in ((1, 0), (0, 1)):
+        here = image[y, x]
+        after = image[np.minimum(y + step_y, ny - 1),
+                      np.minimum(x + step_x, nx - 1)]
+        before = image[np.maximum(y - step_y, 0), np.maximum(x - step_x, 0)]
+        bend = 2 * here - before - after
+        shift = np.divide(0.5 * (after - before), bend, where=bend > 0,
+                          out=np.zeros(x.size))
+        out.append(np.clip(shift, -0.5, 0.5))
+    return out
