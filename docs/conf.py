@@ -45,7 +45,7 @@ else:
 # Names of other packages and of the standard library, by their first word.
 _others = (
     'numpy np scipy astropy photutils gwcs pymc arviz numba matplotlib asdf '
-    'concurrent collections functools pathlib typing')
+    'concurrent collections enum functools pathlib typing')
 _plain = (
     'bool bytes callable complex dict float frozenset int list object '
     'property range set slice str tuple type None True False')

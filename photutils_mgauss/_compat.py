@@ -7,42 +7,113 @@ from weakref import WeakValueDictionary
 
 import photutils
 from astropy.utils import minversion
+from photutils.psf import PSFPhotometry
+from photutils.utils._deprecation import DeprecatedColumnQTable
+from photutils.utils._misc import _get_meta
 
 # Before 3.1, photutils builds one class for all groups of n stars whose model
-# class has the same name, and captures the first model it meets: its state
-# outside Parameters and its ``fixed`` flags serve every later model.
+# has the same class name in ``__class__``, and captures the first model it
+# meets: its state outside Parameters and its ``fixed`` flags serve every
+# later model.
 STALE_GROUP_MODELS = not minversion(photutils, '3.1')
 
 _CLASSES = WeakValueDictionary()
 
 
-def set_identity(model, state):
+def group_class(model):
     """
-    Give the model a class whose name says all that photutils may capture.
+    Return a class whose name says all that photutils may capture.
+
+    It is what a model gives as its ``__class__`` where that is needed. Its
+    ``type`` stays the public class, by which other packages, such as asdf,
+    recognise it.
 
     Parameters
     ----------
     model : `~astropy.modeling.Model`
-        Its class is replaced, in place, by a subclass without any content.
-    state : hashable
-        What is not in Parameter values. The ``fixed`` flags are added.
+        Its ``_state`` is what is not in Parameters, and hashable.
     """
-    if not STALE_GROUP_MODELS:
-        return
-    public = public_class(model)
+    public = type(model)
+    if '_ready' not in model.__dict__:
+        return public
     flags = ''.join('01'[getattr(model, name).fixed]
                     for name in model.param_names)
-    key = (public, state, flags)
+    key = (public, model._state, flags)
     cls = _CLASSES.get(key)
     if cls is None:
-        name = f'{public.__name__}_{state}_{int("1" + flags, 2):x}'
-        members = {'__init__': public.__init__, '__call__': public.__call__,
-                   '__module__': public.__module__, '_public_class': public,
-                   '__doc__': public.__doc__}
-        cls = _CLASSES[key] = type(public)(name, (public,), members)
-    model.__class__ = cls
+        cls = _CLASSES[key] = _named_subclass(public, model._state, flags)
+    # Alive as long as the model, or each look would build another one.
+    model.__dict__['_group_class'] = cls
+    return cls
 
 
-def public_class(model):
-    """Return the class of a model as its users know it."""
-    return getattr(type(model), '_public_class', type(model))
+def _named_subclass(public, state, flags):
+    name = f'{public.__name__}_{state}_{int("1" + flags, 2):x}'
+    members = {'__init__': public.__init__, '__call__': public.__call__,
+               '__module__': public.__module__, '__doc__': public.__doc__}
+    return type(public)(name, (public,), members)
+
+
+# Since 3.1 a star fitted outside its own pixels has a flag of its own, and
+# the flag for bounds looks at all of a model's bounds.
+FLAGS_FIT_REGION = minversion(photutils, '3.1')
+FLAGS_MODEL_BOUNDS = minversion(photutils, '3.1')
+
+
+def prepare_inputs(photometry, data, mask, error, init_params):
+    """
+    Let photutils check its inputs, find stars, estimate fluxes and group.
+
+    Returns
+    -------
+    data, mask, error, init_params : tuple
+        Without units; all None if no stars were found.
+    """
+    return photometry._prepare_fit_inputs(data, mask=mask, error=error,
+                                          init_params=init_params)
+
+
+def split_nddata(data, mask, error):
+    """Return data, mask and error of an NDData object."""
+    check = getattr(PSFPhotometry, '_check_nddata_kwargs', None)
+    if check is not None:
+        check(mask=mask, error=error)
+    return PSFPhotometry._coerce_nddata(data)
+
+
+def reset(photometry):
+    """Forget the results of the last call."""
+    photometry._reset_results()
+
+
+def results_table(columns, meta):
+    """Return the table of results in the class that photutils uses."""
+    table = DeprecatedColumnQTable(columns, meta=meta, copy=False)
+    table.deprecation_map = {'npixfit': 'n_pixels_fit'}
+    table._deprecation_since = '3.0'
+    table._deprecation_until = '4.0'
+    return table
+
+
+def results_meta(photometry):
+    """Return what photutils writes into the meta of its results."""
+    meta = _get_meta()
+    meta['psf_class'] = type(photometry).__name__
+    for name in photometry._attrs:
+        value = getattr(photometry, name)
+        by_repr = name in ('psf_model', 'finder', 'grouper', 'fitter',
+                           'local_bkg_estimator')
+        meta[name] = repr(value) if by_repr and value is not None else value
+    return meta
+
+
+def group_members(model):
+    """
+    Return the PSF model of a group's stars and how many there are.
+
+    Since 2.3 photutils fits a group as one model that lists the parameters
+    of one star after those of the other. Any other model is its own only
+    member.
+    """
+    base = getattr(model, 'base_psf_model', None)
+    return (model, 1) if base is None else (base, model.n_sources)

@@ -20,10 +20,12 @@ factors of its exponent when :math:`x` is conditioned on :math:`y`,
 This form loses no digits to cancellation when the Gaussian is thin and
 tilted, and it is what a walk along a pixel row needs.
 """
-from math import ceil, erf, exp, sqrt
+from decimal import Decimal
+from math import ceil, erf, exp, factorial, floor, log, sqrt
 
 import numpy as np
-from numba import njit
+from numba import njit, types
+from numba.extending import intrinsic
 
 _jit = njit(cache=True, nogil=True, error_model='numpy')
 
@@ -39,6 +41,55 @@ _NOTHING = 1e-290
 _LOG_NOTHING = -2 * np.log(_NOTHING)
 
 _HALF_PI_ROOT = sqrt(np.pi / 2)
+
+
+# The exponential function, in a form that the compiler turns into vector
+# instructions: four to five times as fast in a loop over pixels as the one of
+# the C library, and as accurate.
+
+# 1.5 * 2^52: adding it rounds to an integer, which then is in the low bits.
+_ROUND = 1.5 * 2.0**52
+_LOG2_E = 1 / np.log(2)
+# log(2) in two parts; 32 bits times an exponent of 11 bits make no error.
+_LOG2_HIGH = np.floor(np.log(2) * 2.0**32) / 2.0**32
+_LOG2_LOW = float(Decimal(2).ln() - Decimal(_LOG2_HIGH))
+# Taylor's series; |r| < log(2) / 2 leaves 4e-18 after 13 terms.
+_TERMS = tuple(1 / factorial(n) for n in range(13, -1, -1))
+
+
+@intrinsic
+def _float_of_bits(context, bits):
+    def generate(context, builder, signature, args):
+        return builder.bitcast(args[0],
+                               context.get_value_type(types.float64))
+    return types.float64(types.int64), generate
+
+
+@intrinsic
+def _bits_of_float(context, number):
+    def generate(context, builder, signature, args):
+        return builder.bitcast(args[0], context.get_value_type(types.int64))
+    return types.int64(types.float64), generate
+
+
+@_jit
+def _exp(x):
+    """Return exp(x) for x <= 0, and 0 where that is below 1e-299."""
+    shifted = x * _LOG2_E + _ROUND
+    n = shifted - _ROUND
+    r = (x - n * _LOG2_HIGH) - n * _LOG2_LOW
+    series = _TERMS[0]
+    for term in _TERMS[1:]:
+        series = series * r + term
+    power = _float_of_bits((_bits_of_float(shifted) + 1023) << 52)
+    return 0.0 if x < -688 else series * power
+
+
+@_jit
+def exponentials(x, out):
+    """Put exp(x), x <= 0, into out (n,); for tests."""
+    for i in range(x.size):
+        out[i] = _exp(x[i])
 
 
 # One Gaussian at one point. (dx, dy) is the offset from the centre.
@@ -155,14 +206,57 @@ def _hessian(dx, dy, p, s, q, integrated):
 # Mixtures at arbitrary points. rows is (K, 6); x and y are (n,).
 
 @_jit
+def _add_values(x, y, x_0, y_0, row, scale, integrated, out):
+    """Add a Gaussian, centred on (x_0, y_0) plus its mean, to out (n,)."""
+    a, mx, my, p, s, q = row
+    peak = scale * a
+    left, bottom = x_0 + mx, y_0 + my
+    if integrated:
+        for i in range(x.size):
+            out[i] += peak * _pixel_integral(x[i] - left, y[i] - bottom, p, s,
+                                             q)
+        return
+    for i in range(x.size):
+        dy = y[i] - bottom
+        u = x[i] - left - s * dy
+        out[i] += peak * _exp(-0.5 * (p * u * u + q * dy * dy))
+
+
+@_jit
+def _add_jet(x, y, x_0, y_0, row, scales, integrated, out):
+    """
+    Add value, slope by x_0 and slope by y_0 of a Gaussian to out (3, n).
+
+    scales (3,) is what multiplies it, and the slopes of that.
+    """
+    a, mx, my, p, s, q = row
+    value, by_x, by_y = a * scales[0], a * scales[1], a * scales[2]
+    left, bottom = x_0 + mx, y_0 + my
+    if integrated:
+        for i in range(x.size):
+            dx, dy = x[i] - left, y[i] - bottom
+            g = _pixel_integral(dx, dy, p, s, q)
+            gx, gy = _gradient(dx, dy, p, s, q, True)
+            out[0, i] += value * g
+            out[1, i] += by_x * g - value * gx
+            out[2, i] += by_y * g - value * gy
+        return
+    for i in range(x.size):
+        dy = y[i] - bottom
+        u = x[i] - left - s * dy
+        g = _exp(-0.5 * (p * u * u + q * dy * dy))
+        slope = p * u
+        out[0, i] += value * g
+        out[1, i] += (by_x + value * slope) * g
+        out[2, i] += (by_y + value * (q * dy - s * slope)) * g
+
+
+@_jit
 def evaluate(x, y, rows, integrated, out):
     """Put the mixture at the points into out (n,)."""
-    for i in range(x.size):
-        total = 0.0
-        for k in range(rows.shape[0]):
-            a, mx, my, p, s, q = rows[k]
-            total += a * _value(x[i] - mx, y[i] - my, p, s, q, integrated)
-        out[i] = total
+    out[:] = 0.0
+    for k in range(rows.shape[0]):
+        _add_values(x, y, 0.0, 0.0, rows[k], 1.0, integrated, out)
 
 
 @_jit
@@ -327,26 +421,26 @@ def evaluate_grid(x, y, flux, x_0, y_0, nodes, x_grid, y_grid, integrated,
     """
     Put the blended PSF at the points into out (n,).
 
-    flux, x_0 and y_0 have one element or n.
+    flux has one element or n; x_0 and y_0 have one element, or n for a star
+    of its own at each point.
     """
     index = np.empty(4, np.int64)
     weights = np.empty((3, 4))
-    for i in range(x.size):
-        c = i if x_0.size > 1 else 0
-        if i == 0 or x_0.size > 1:
-            blend_weights(x_0[c], y_0[c], x_grid, y_grid, index, weights)
-        total = 0.0
+    per_point = x_0.size > 1
+    out[:] = 0.0
+    for star in range(x_0.size):
+        points = slice(star, star + 1) if per_point else slice(0, x.size)
+        blend_weights(x_0[star], y_0[star], x_grid, y_grid, index, weights)
         for corner in range(4):
-            if weights[0, corner] == 0:
+            w = weights[0, corner]
+            if w == 0:
                 continue
-            part = 0.0
-            for k in range(nodes.shape[1]):
-                a, mx, my, p, s, q = nodes[index[corner], k]
-                if a != 0:
-                    part += a * _value(x[i] - x_0[c] - mx, y[i] - y_0[c] - my,
-                                       p, s, q, integrated)
-            total += weights[0, corner] * part
-        out[i] = total * flux[i if flux.size > 1 else 0]
+            for row in nodes[index[corner]]:
+                if row[0] != 0:
+                    _add_values(x[points], y[points], x_0[star], y_0[star],
+                                row, w, integrated, out[points])
+    for i in range(x.size):
+        out[i] *= flux[i if flux.size > 1 else 0]
 
 
 @_jit
@@ -361,30 +455,35 @@ def differentiate_grid(x, y, x_0, y_0, nodes, x_grid, y_grid, integrated,
     index = np.empty(4, np.int64)
     weights = np.empty((3, 4))
     blend_weights(x_0, y_0, x_grid, y_grid, index, weights)
-    for i in range(x.size):
-        total = 0.0
-        by_x = 0.0
-        by_y = 0.0
-        for corner in range(4):
-            value = 0.0
-            gx = 0.0
-            gy = 0.0
-            for k in range(nodes.shape[1]):
-                a, mx, my, p, s, q = nodes[index[corner], k]
-                if a == 0:
-                    continue
-                dx, dy = x[i] - x_0 - mx, y[i] - y_0 - my
-                dgx, dgy = _gradient(dx, dy, p, s, q, integrated)
-                value += a * _value(dx, dy, p, s, q, integrated)
-                gx += a * dgx
-                gy += a * dgy
-            w = weights[0, corner]
-            total += w * value
-            by_x += weights[1, corner] * value - w * gx
-            by_y += weights[2, corner] * value - w * gy
-        out[0, i] = total
-        out[1, i] = by_x
-        out[2, i] = by_y
+    out[:] = 0.0
+    for corner in range(4):
+        for row in nodes[index[corner]]:
+            if row[0] != 0:
+                _add_jet(x, y, x_0, y_0, row, weights[:, corner], integrated,
+                         out)
+
+
+@_jit
+def _add_stamp(rows, x_0, y_0, flux, integrated, px, py, out):
+    """Add a star to a stamp (ny, nx) whose pixels are at px and py (n,)."""
+    if integrated:
+        render(rows, x_0, y_0, flux, integrated, out)
+        return
+    # A stamp has few pixels in a row: taken as one row, it fills vectors.
+    for row in rows:
+        if row[0] != 0:
+            _add_values(px, py, x_0, y_0, row, flux, False,
+                        out.reshape(px.size))
+
+
+@_jit
+def _pixel_positions(ny, nx):
+    px = np.empty(ny * nx)
+    py = np.empty(ny * nx)
+    for i in range(px.size):
+        py[i] = i // nx
+        px[i] = i % nx
+    return px, py
 
 
 @_jit
@@ -397,11 +496,13 @@ def render_grid(x, y, flux, left, bottom, nodes, x_grid, y_grid, integrated,
     """
     index = np.empty(4, np.int64)
     weights = np.empty((3, 4))
+    px, py = _pixel_positions(out.shape[1], out.shape[2])
     for i in range(x.size):
         blend_weights(x[i], y[i], x_grid, y_grid, index, weights)
         for corner in range(4):
             w = weights[0, corner] * flux[i]
             if w != 0:
+<<<<<<< HEAD
                 render(nodes[index[corner]], x[i] - left[i], y[i] - bottom[i],
                        w, integrated, out[i])
 
@@ -733,10 +834,1206 @@ def _cholesky(a, n):
                 a[i, i] = sqrt(total)
             else:
                 a[i, j] = total / a[j, j]
+=======
+                _add_stamp(nodes[index[corner]], x[i] - left[i],
+                           y[i] - bottom[i], w, integrated, px, py, out[i])
+
+
+# A grid of mixtures whose Gaussians are matched, blended one by one: the four
+# that belong together are replaced by the one with the flux, centroid and
+# second moments of their sum. sums is (M, K, 6) and holds of each Gaussian
+# the integrals of 1, x, y, x^2, xy, y^2, which blend linearly.
+
+@_jit
+def match_rows(x_0, y_0, sums, x_grid, y_grid, rows, slopes):
+    """
+    Put the K blended Gaussians at (x_0, y_0) into rows (K, 6).
+
+    slopes (2, K, 6) takes the derivatives by x_0 and y_0 of log flux, mean
+    and covariance (xx, xy, yy).
+    """
+    index = np.empty(4, np.int64)
+    weights = np.empty((3, 4))
+    blend_weights(x_0, y_0, x_grid, y_grid, index, weights)
+    blended = np.empty(6)
+    slope = np.empty(6)
+    for k in range(rows.shape[0]):
+        _blend_sums(index, weights[0], sums, k, blended)
+        rows[k] = 0.0
+        slopes[:, k] = 0.0
+        if blended[0] == 0:
+            rows[k, 3] = rows[k, 5] = 1.0
+            continue
+        f, mx, my, sxx, sxy, syy = _central(blended)
+        s = sxy / syy
+        p = 1 / (sxx - s * sxy)
+        rows[k] = np.array([f * sqrt(p / syy) / (2 * np.pi), mx, my, p, s,
+                            1 / syy])
+        for axis in range(2):
+            _blend_sums(index, weights[1 + axis], sums, k, slope)
+            df = slope[0] / f
+            dx = slope[1] / f - mx * df
+            dy = slope[2] / f - my * df
+            slopes[axis, k, 0] = df
+            slopes[axis, k, 1] = dx
+            slopes[axis, k, 2] = dy
+            slopes[axis, k, 3] = (slope[3] / f - (sxx + mx * mx) * df
+                                  - 2 * mx * dx)
+            slopes[axis, k, 4] = (slope[4] / f - (sxy + mx * my) * df
+                                  - mx * dy - my * dx)
+            slopes[axis, k, 5] = (slope[5] / f - (syy + my * my) * df
+                                  - 2 * my * dy)
+
+
+@_jit
+def _blend_sums(index, weights, sums, k, out):
+    for j in range(6):
+        out[j] = 0.0
+        for corner in range(4):
+            out[j] += weights[corner] * sums[index[corner], k, j]
+
+
+@_jit
+def _central(sums):
+    """Return flux, mean and covariance of what has these integrals."""
+    f = sums[0]
+    mx, my = sums[1] / f, sums[2] / f
+    return (f, mx, my, sums[3] / f - mx * mx, sums[4] / f - mx * my,
+            sums[5] / f - my * my)
+
+
+@_jit
+def evaluate_matched(x, y, flux, x_0, y_0, sums, x_grid, y_grid, integrated,
+                     out):
+    """Put the PSF of matched Gaussians into out; as `evaluate_grid`."""
+    rows = np.empty(sums.shape[1:])
+    slopes = np.empty((2, sums.shape[1], 6))
+    per_point = x_0.size > 1
+    out[:] = 0.0
+    for star in range(x_0.size):
+        points = slice(star, star + 1) if per_point else slice(0, x.size)
+        match_rows(x_0[star], y_0[star], sums, x_grid, y_grid, rows, slopes)
+        for row in rows:
+            _add_values(x[points], y[points], x_0[star], y_0[star], row, 1.0,
+                        integrated, out[points])
+    for i in range(x.size):
+        out[i] *= flux[i if flux.size > 1 else 0]
+
+
+@_jit
+def differentiate_matched(x, y, x_0, y_0, sums, x_grid, y_grid, integrated,
+                          out):
+    """Put value and derivatives into out (3, n); as `differentiate_grid`."""
+    rows = np.empty(sums.shape[1:])
+    slopes = np.empty((2, sums.shape[1], 6))
+    match_rows(x_0, y_0, sums, x_grid, y_grid, rows, slopes)
+    out[:] = 0.0
+    for k in range(rows.shape[0]):
+        a, mx, my, p, s, q = rows[k]
+        for i in range(x.size):
+            dx, dy = x[i] - x_0 - mx, y[i] - y_0 - my
+            g = _value(dx, dy, p, s, q, integrated)
+            gx, gy = _gradient(dx, dy, p, s, q, integrated)
+            gxx, gxy, gyy = _hessian(dx, dy, p, s, q, integrated)
+            out[0, i] += a * g
+            for axis in range(2):
+                # The heat equation turns slopes of the covariance into
+                # second derivatives.
+                d = slopes[axis, k]
+                out[1 + axis, i] += a * (
+                    d[0] * g - d[1] * gx - d[2] * gy + 0.5 * d[3] * gxx
+                    + d[4] * gxy + 0.5 * d[5] * gyy)
+            out[1, i] -= a * gx
+            out[2, i] -= a * gy
+
+
+@_jit
+def render_matched(x, y, flux, left, bottom, sums, x_grid, y_grid,
+                   integrated, out):
+    """Add stars of matched Gaussians to stamps; as `render_grid`."""
+    rows = np.empty(sums.shape[1:])
+    slopes = np.empty((2, sums.shape[1], 6))
+    px, py = _pixel_positions(out.shape[1], out.shape[2])
+    for i in range(x.size):
+        match_rows(x[i], y[i], sums, x_grid, y_grid, rows, slopes)
+        _add_stamp(rows, x[i] - left[i], y[i] - bottom[i], flux[i],
+                   integrated, px, py, out[i])
+
+
+# Many stars on one image. A Gaussian is drawn where it exceeds ``faintest``,
+# which the caller chooses so low that nobody sees the edge, and anyway down
+# to this fraction of its peak. Nothing is fitted with these functions, so
+# the step at the edge does no harm.
+_DEPTH = 1e-3
+
+
+def _quadrature_tables(most=8):
+    """
+    Return nodes and weights (most + 1, most) of 0 to 8 points, and errors.
+
+    On a unit interval n points miss a Gaussian of unit peak and precision P
+    by less than errors[n] P^n, (n!)^4 (2n - 1)!! / ((2n + 1) (2n)!^3).
+    """
+    nodes = np.zeros((most + 1, most))
+    weights = np.zeros((most + 1, most))
+    errors = np.zeros(most + 1)
+    for n in range(1, most + 1):
+        places, shares = np.polynomial.legendre.leggauss(n)
+        nodes[n, :n], weights[n, :n] = places / 2, shares / 2
+        twice = float(factorial(2 * n))
+        odd = twice / (2**n * factorial(n))
+        errors[n] = factorial(n)**4 * odd / ((2 * n + 1) * twice**3)
+    return nodes, weights, errors
+
+
+_POINTS, _SHARES, _ERRORS = _quadrature_tables()
+
+# What integrating by points may miss, in units of the brightest Gaussian of
+# the star. The error is even about the star, so that it moves nothing.
+_QUADRATURE_ERROR = 1e-5
+
+
+@_jit
+def _quadrature_order(precision, tolerance):
+    """Return the number of points that suffice, or 0 if none does."""
+    power = 1.0
+    for n in range(1, _ERRORS.size):
+        power *= precision
+        if _ERRORS[n] * power <= tolerance:
+            return n
+    return 0
+
+
+@_jit
+def _walk(peak, right, left, fall, start, first, last, row):
+    """
+    Add a row Gaussian to row[first:last + 1], from its value at start.
+
+    right and left are the first quotients of neighbours, fall their change.
+    """
+    row[start] += peak
+    g = peak
+    for i in range(start + 1, last + 1):
+        g *= right
+        right *= fall
+        row[i] += g
+    g = peak
+    for i in range(start - 1, first - 1, -1):
+        g *= left
+        left *= fall
+        row[i] += g
+
+
+@_jit
+def _add_sampled(peak, cx, cy, p, s, q, reach, out):
+    """Add a Gaussian, sampled at pixel centres, to out (ny, nx)."""
+    half = sqrt(reach / q)
+    fall = exp(-p)
+    low, high = max(0, ceil(cy - half)), min(out.shape[0] - 1, cy + half)
+    for j in range(low, floor(high) + 1):
+        dy = j - cy
+        centre = cx + s * dy
+        width = sqrt(max(0.0, reach - q * dy * dy) / p)
+        first = max(0, ceil(centre - width))
+        last = min(out.shape[1] - 1, floor(centre + width))
+        if first > last:
+            continue
+        start = min(max(int(np.rint(centre)), first), last)
+        u = start - centre
+        _walk(peak * exp(-0.5 * (p * u * u + q * dy * dy)),
+              exp(-p * (u + 0.5)), exp(-p * (0.5 - u)), fall, start, first,
+              last, out[j])
+
+
+@_jit
+def _prepare_points(n, p, scratch):
+    """
+    Put what the points along x share into scratch (3, n).
+
+    A point at the fraction t of a pixel has the value of the pixel's centre
+    at u times exp(-p u t) and the first row; the quotients to its neighbours
+    are those of u times the second and third.
+    """
+    for a in range(n):
+        t = _POINTS[n, a]
+        scratch[0, a] = _SHARES[n, a] * exp(-0.5 * p * t * t)
+        scratch[1, a] = exp(-p * (0.5 + t))
+        scratch[2, a] = exp(-p * (0.5 - t))
+
+
+@_jit
+def _add_integrated(peak, cx, cy, p, s, q, reach, tolerance, scratch, out):
+    """Add a Gaussian, integrated over each pixel, to out (ny, nx)."""
+    n_x = _quadrature_order(p, tolerance)
+    n_y = _quadrature_order(q + s * s * p, tolerance)
+    if n_x * n_y == 0:
+        _add_thin(peak, cx, cy, p, s, q, reach, out)
+        return
+    _prepare_points(n_x, p, scratch)
+    half = sqrt(reach / q) + 0.5
+    fall = exp(-p)
+    low, high = max(0, ceil(cy - half)), min(out.shape[0] - 1, cy + half)
+    for j in range(low, floor(high) + 1):
+        for b in range(n_y):
+            dy = j - cy + _POINTS[n_y, b]
+            centre = cx + s * dy
+            width = sqrt(max(0.0, reach - q * dy * dy) / p) + 0.5
+            first = max(0, ceil(centre - width))
+            last = min(out.shape[1] - 1, floor(centre + width))
+            if first > last:
+                continue
+            start = min(max(int(np.rint(centre)), first), last)
+            u = start - centre
+            ridge = (peak * _SHARES[n_y, b]
+                     * exp(-0.5 * (p * u * u + q * dy * dy)))
+            slope = exp(-p * u)
+            for a in range(n_x):
+                _walk(ridge * exp(-p * u * _POINTS[n_x, a]) * scratch[0, a],
+                      slope * scratch[1, a], scratch[2, a] / slope, fall,
+                      start, first, last, out[j])
+
+
+@_jit
+def _add_thin(peak, cx, cy, p, s, q, reach, out):
+    """Add a Gaussian much thinner than a pixel, integrated over each."""
+    half_y = sqrt(reach / q) + 0.5
+    half_x = sqrt(reach * (1 / p + s * s / q)) + 0.5
+    first = max(0, ceil(cx - half_x))
+    last = min(out.shape[1] - 1, floor(cx + half_x))
+    low, high = max(0, ceil(cy - half_y)), min(out.shape[0] - 1, cy + half_y)
+    if first > last:
+        return
+    for j in range(low, floor(high) + 1):
+        _add_integrated_row(peak, first - cx, j - cy, p, s, q,
+                            out[j, first:last + 1])
+
+
+@_jit
+def render_image(x, y, flux, nodes, x_grid, y_grid, integrated, faintest,
+                 left, bottom, out):
+    """
+    Add stars (n,) in the order given to out.
+
+    The first pixel of out is the detector's (left, bottom). The order of the
+    stars alone decides about rounding: a band of rows has the pixels it would
+    have in the whole image.
+    """
+    index = np.empty(4, np.int64)
+    weights = np.empty((3, 4))
+    scratch = np.empty((3, _ERRORS.size))
+    for i in range(x.size):
+        blend_weights(x[i], y[i], x_grid, y_grid, index, weights)
+        for corner in range(4):
+            share = weights[0, corner] * flux[i]
+            if share == 0:
+                continue
+            highest = 0.0
+            for k in range(nodes.shape[1]):
+                highest = max(highest, abs(nodes[index[corner], k, 0]))
+            for k in range(nodes.shape[1]):
+                a, mx, my, p, s, q = nodes[index[corner], k]
+                if a == 0:
+                    continue
+                cx, cy = x[i] + mx - left, y[i] + my - bottom
+                reach = 2 * log(max(abs(share * a) / faintest, 1 / _DEPTH))
+                if integrated:
+                    _add_integrated(share * a, cx, cy, p, s, q, reach,
+                                    _QUADRATURE_ERROR * highest / abs(a),
+                                    scratch, out)
+                else:
+                    _add_sampled(share * a, cx, cy, p, s, q, reach, out)
+# Least-squares fits of a mixture to a stamp. Everything is in stamp pixels
+# about a centre near the middle of the stamp. A Gaussian of flux f is a row of
+# five shape numbers, x, y, log l, t, log m, the mean and the Cholesky factor
+# of the precision matrix:
+#
+#     g = f l m / (2 pi) exp(-(a^2 + b^2) / 2),  a = l u + t v,  b = m v,
+#
+# with (u, v) the offset from the mean. Every parameter vector is a Gaussian.
+# All derivatives are g times a polynomial of degree 2 in x and y, so the
+# normal matrix follows from the moments up to degree 4 of the products of two
+# Gaussians: 5 sums a pixel and pair where the Jacobian would need 21 and more.
+#
+# The fluxes are linear. They are solved for exactly at every step, and the
+# shapes move along the Jacobian projected off them (variable projection in
+# Kaufman's form); the joint normal matrix with undamped fluxes does both.
+
+_LOG_2PI = float(np.log(2 * np.pi))
+
+# Rows of `limits`, see `penalty`.
+_NARROW, _WIDE, _REACH_X, _REACH_Y, _STIFFNESS = range(5)
+
+# What fit_stamp returns.
+FIT_CONVERGED, FIT_STOPPED = range(2)
+
+
+@_jit
+def draw_unit(shapes, cx, cy, images):
+    """Put Gaussians of unit flux into images (K, ny, nx)."""
+    for k in range(shapes.shape[0]):
+        mx, my, log_l, t, log_m = shapes[k]
+        length, m = exp(log_l), exp(log_m)
+        peak = exp(log_l + log_m - _LOG_2PI)
+        for j in range(images.shape[1]):
+            row = images[k, j]
+            row[:] = 0.0
+            v = j - cy - my
+            q = m * m * v * v
+            if q < _LOG_NOTHING:
+                _add_row(peak * exp(-0.5 * q), -cx - mx + t / length * v,
+                         length * length, row)
+
+
+@_jit
+def _columns_of_product(a, b, weight, cy, columns):
+    """
+    Put sum_y w a b y^m into columns[m, x], m <= 4.
+
+    Four columns at a time with sums of their own: the compiler packs them
+    into vectors, which it must not do to a single sum.
+    """
+    ny, nx = a.shape
+    blocks = nx - nx % 4
+    for i in range(0, blocks, 4):
+        p0, p1, p2, p3 = 0.0, 0.0, 0.0, 0.0
+        q0, q1, q2, q3 = 0.0, 0.0, 0.0, 0.0
+        r0, r1, r2, r3 = 0.0, 0.0, 0.0, 0.0
+        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+        t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
+        for j in range(ny):
+            v = j - cy
+            h0 = weight[j, i] * a[j, i] * b[j, i]
+            h1 = weight[j, i + 1] * a[j, i + 1] * b[j, i + 1]
+            h2 = weight[j, i + 2] * a[j, i + 2] * b[j, i + 2]
+            h3 = weight[j, i + 3] * a[j, i + 3] * b[j, i + 3]
+            p0, p1, p2, p3 = p0 + h0, p1 + h1, p2 + h2, p3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            q0, q1, q2, q3 = q0 + h0, q1 + h1, q2 + h2, q3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            r0, r1, r2, r3 = r0 + h0, r1 + h1, r2 + h2, r3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            s0, s1, s2, s3 = s0 + h0, s1 + h1, s2 + h2, s3 + h3
+            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
+            t0, t1, t2, t3 = t0 + h0, t1 + h1, t2 + h2, t3 + h3
+        _put(columns[0], i, p0, p1, p2, p3)
+        _put(columns[1], i, q0, q1, q2, q3)
+        _put(columns[2], i, r0, r1, r2, r3)
+        _put(columns[3], i, s0, s1, s2, s3)
+        _put(columns[4], i, t0, t1, t2, t3)
+    for i in range(blocks, nx):
+        p, q, r, s, t = 0.0, 0.0, 0.0, 0.0, 0.0
+        for j in range(ny):
+            v = j - cy
+            h = weight[j, i] * a[j, i] * b[j, i]
+            p += h
+            q += h * v
+            r += h * v * v
+            s += h * v * v * v
+            t += h * v * v * v * v
+        columns[0, i], columns[1, i], columns[2, i] = p, q, r
+        columns[3, i], columns[4, i] = s, t
+
+
+@_jit
+def _put(row, i, a, b, c, d):
+    row[i], row[i + 1], row[i + 2], row[i + 3] = a, b, c, d
+
+
+@_jit
+def _moments_of_product(a, b, weight, cx, cy, columns, out):
+    """
+    Put sum_pixels w a b x^n y^m into out[n, m], n + m <= 4.
+
+    columns (5, nx) is scratch.
+    """
+    _columns_of_product(a, b, weight, cy, columns)
+    a0, a1, a2, a3, a4 = 0.0, 0.0, 0.0, 0.0, 0.0
+    b0, b1, b2, b3 = 0.0, 0.0, 0.0, 0.0
+    c0, c1, c2 = 0.0, 0.0, 0.0
+    d0, d1, e0 = 0.0, 0.0, 0.0
+    for i in range(columns.shape[1]):
+        x = i - cx
+        xx = x * x
+        s0, s1, s2 = columns[0, i], columns[1, i], columns[2, i]
+        a0, a1, a2 = a0 + s0, a1 + s1, a2 + s2
+        a3, a4 = a3 + columns[3, i], a4 + columns[4, i]
+        b0, b1 = b0 + x * s0, b1 + x * s1
+        b2, b3 = b2 + x * s2, b3 + x * columns[3, i]
+        c0, c1, c2 = c0 + xx * s0, c1 + xx * s1, c2 + xx * s2
+        d0, d1 = d0 + xx * x * s0, d1 + xx * x * s1
+        e0 += xx * xx * s0
+    out[0, 0], out[0, 1], out[0, 2], out[0, 3], out[0, 4] = a0, a1, a2, a3, a4
+    out[1, 0], out[1, 1], out[1, 2], out[1, 3] = b0, b1, b2, b3
+    out[2, 0], out[2, 1], out[2, 2] = c0, c1, c2
+    out[3, 0], out[3, 1], out[4, 0] = d0, d1, e0
+
+
+@_jit
+def _polynomials(shape, out):
+    """
+    Put g and its derivatives by the five shape numbers into out (6, 6).
+
+    As multiples of g: the coefficients of 1, x, y, xx, xy, yy.
+    """
+    mx, my, log_l, t, log_m = shape
+    length, m = exp(log_l), exp(log_m)
+    # a = length x + t y + a0, b = m y + b0.
+    a0 = -length * mx - t * my
+    b0 = -m * my
+    out[:] = 0.0
+    out[0, 0] = 1.0
+    out[1, 0], out[1, 1], out[1, 2] = length * a0, length * length, length * t
+    out[2, 0] = t * a0 + m * b0
+    out[2, 1] = t * length
+    out[2, 2] = t * t + m * m
+    # 1 - length u a
+    out[3, 0] = 1.0 + length * mx * a0
+    out[3, 1] = -length * a0 + length * mx * length
+    out[3, 2] = length * mx * t
+    out[3, 3] = -length * length
+    out[3, 4] = -length * t
+    # -v a
+    out[4, 0] = my * a0
+    out[4, 1] = my * length
+    out[4, 2] = my * t - a0
+    out[4, 4] = -length
+    out[4, 5] = -t
+    # 1 - b^2
+    out[5, 0] = 1.0 - b0 * b0
+    out[5, 2] = -2 * m * b0
+    out[5, 5] = -m * m
+
+
+# The powers of x and y in the monomials 1, x, y, xx, xy, yy.
+_POWER_X = np.array([0, 1, 0, 2, 1, 0])
+_POWER_Y = np.array([0, 0, 1, 0, 1, 2])
+
+
+@_jit
+def _contract(left, moments, right, half, out):
+    """
+    Put the moments of a product, seen by its parameters, into out (6, 6).
+
+    left and right (6, 6) are the polynomials of the two Gaussians; half
+    (6, 6) is scratch.
+    """
+    half[:] = 0.0
+    for a in range(6):
+        for c in range(6):
+            moment = moments[_POWER_X[a] + _POWER_X[c],
+                             _POWER_Y[a] + _POWER_Y[c]]
+            for j in range(6):
+                half[a, j] += moment * right[j, c]
+    out[:] = 0.0
+    for i in range(6):
+        for a in range(6):
+            for j in range(6):
+                out[i, j] += left[i, a] * half[a, j]
+
+
+@_jit
+def _factor(matrix, n):
+    """
+    Overwrite the lower triangle of matrix (n, n) by its Cholesky factor.
+
+    A pivot lost to rounding is replaced by a huge one, which sets the unknown
+    to zero instead of ending the fit.
+    """
+    for j in range(n):
+        diagonal = matrix[j, j]
+        pivot = diagonal
+        for k in range(j):
+            pivot -= matrix[j, k] * matrix[j, k]
+        if not pivot > 1e-14 * diagonal:
+            pivot = 1e30 * max(diagonal, 1e-30)
+        root = sqrt(pivot)
+        matrix[j, j] = root
+        for i in range(j + 1, n):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = total / root
+
+
+@_jit
+def _solve_factored(factor, n, x):
+    """Overwrite x (n,) by the solution of factor factor^T y = x."""
+    for i in range(n):
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= factor[k, i] * x[k]
+        x[i] /= factor[i, i]
+
+
+@_jit
+def _solve_subset(gram, rhs, active, x, work):
+    """Solve gram x = rhs over the active unknowns; the others are zero."""
+    n = rhs.size
+    count = 0
+    for i in range(n):
+        if not active[i]:
+            continue
+        column = 0
+        for j in range(i + 1):
+            if active[j]:
+                work[count, column] = gram[i, j]
+                column += 1
+        work[count, n] = rhs[i]
+        count += 1
+    _factor(work, count)
+    solution = work[:count, n].copy()
+    _solve_factored(work, count, solution)
+    count = 0
+    for i in range(n):
+        x[i] = 0.0
+        if active[i]:
+            x[i] = solution[count]
+            count += 1
+
+
+@_jit
+def _steepest(gram, rhs, active, x):
+    """Return the inactive unknown that would lower the cost most, or -1."""
+    best, gain = -1, 0.0
+    for i in range(rhs.size):
+        if active[i]:
+            continue
+        slope = rhs[i]
+        for j in range(rhs.size):
+            slope -= gram[i, j] * x[j]
+        if slope > 1e-12 * abs(rhs[i]) + gain:
+            best, gain = i, slope
+    return best
+
+
+@_jit
+def _solve_fluxes(gram, rhs, signed, x, active, work):
+    """
+    Solve min |G x - z| given gram = G^T G and rhs = G^T z.
+
+    Unless signed, x >= 0: Lawson and Hanson's active set, started from all
+    unknowns free. work is (n, n + 1).
+    Solve min |G x - z| with x >= 0, unless signed.
+
+    gram is G^T G, rhs G^T z. Lawson and Hanson's active set, started from
+    all unknowns free. work is (n, n + 1).
+    """
+    n = rhs.size
+    active[:] = True
+    _solve_subset(gram, rhs, active, x, work)
+    if signed:
+        return
+    for _ in range(3 * n):
+        worst = np.argmin(x)
+        if x[worst] < 0:
+            active[worst] = False
+            _solve_subset(gram, rhs, active, x, work)
+            continue
+        best = _steepest(gram, rhs, active, x)
+        if best < 0:
+            return
+        active[best] = True
+        _solve_subset(gram, rhs, active, x, work)
+        if x[best] <= 0:
+            active[best] = False
+            _solve_subset(gram, rhs, active, x, work)
+            return
+    for i in range(n):
+        x[i] = max(x[i], 0.0)
+
+
+@_jit
+def _hinge(excess, slopes, stiffness, matrix, gradient):
+    """Add the square of an excess > 0 to the normal equations of one shape."""
+    if excess <= 0:
+        return 0.0
+    for i in range(5):
+        gradient[i] -= stiffness * excess * slopes[i]
+        for j in range(5):
+            matrix[i, j] += stiffness * slopes[i] * slopes[j]
+    return stiffness * excess * excess
+
+
+@_jit
+def penalty(shape, limits, matrix, gradient):
+    """
+    Return the price of a Gaussian outside its limits.
+
+    The limits hold for the widths of its cuts along x and y (not narrower
+    than the pixels can show) and of its projections (not wider than the
+    stamp), and for its mean (on the stamp). Inside them the price is zero; it
+    grows with the square of the excess. matrix (5, 5) and gradient (5,)
+    receive its share of the normal equations.
+    """
+    x, y, log_l, t, log_m = shape
+    m = exp(log_m)
+    stiffness = limits[_STIFFNESS]
+    slopes = np.zeros(5)
+    slopes[2] = 1.0
+    price = _hinge(log_l + limits[_NARROW], slopes, stiffness, matrix,
+                   gradient)
+    norm = t * t + m * m
+    slopes[2], slopes[3], slopes[4] = 0.0, t / norm, m * m / norm
+    price += _hinge(0.5 * np.log(norm) + limits[_NARROW], slopes, stiffness,
+                    matrix, gradient)
+    slopes[2], slopes[4] = -1.0, m * m / norm - 1
+    price += _hinge(0.5 * np.log(norm) - log_l - log_m - limits[_WIDE],
+                    slopes, stiffness, matrix, gradient)
+    slopes[2], slopes[3], slopes[4] = 0.0, 0.0, -1.0
+    price += _hinge(-log_m - limits[_WIDE], slopes, stiffness, matrix,
+                    gradient)
+    slopes[4] = 0.0
+    slopes[0] = 1 / limits[_REACH_X] if x > 0 else -1 / limits[_REACH_X]
+    price += _hinge(abs(x) / limits[_REACH_X] - 1, slopes, stiffness, matrix,
+                    gradient)
+    slopes[0] = 0.0
+    slopes[1] = 1 / limits[_REACH_Y] if y > 0 else -1 / limits[_REACH_Y]
+    price += _hinge(abs(y) / limits[_REACH_Y] - 1, slopes, stiffness, matrix,
+                    gradient)
+    return price
+
+
+@_jit
+def _residual(stamp, images, fluxes, out):
+    """Put stamp minus model into out (ny, nx)."""
+    for j in range(stamp.shape[0]):
+        for i in range(stamp.shape[1]):
+            out[j, i] = stamp[j, i]
+    for k in range(fluxes.size):
+        for j in range(stamp.shape[0]):
+            for i in range(stamp.shape[1]):
+                out[j, i] -= fluxes[k] * images[k, j, i]
+
+
+@_jit
+def project(stamp, weight, centre, shapes, tie, signed, fluxes, scratch):
+    """
+    Put the best fluxes for the shapes into fluxes; return the chi square.
+
+    tie is the total flux and the weight of that condition (0: free). The
+    images and the residual are left in scratch.
+    """
+    images, residual, gram, rhs, work, active = scratch[:6]
+    total, tie_weight = tie
+    draw_unit(shapes, centre[0], centre[1], images)
+    n = fluxes.size
+    for k in range(n):
+        rhs[k] = _weighted_dot(images[k], stamp, weight) + tie_weight * total
+        for other in range(k + 1):
+            dot = _weighted_dot(images[k], images[other], weight) + tie_weight
+            gram[k, other] = gram[other, k] = dot
+    _solve_fluxes(gram, rhs, signed, fluxes, active, work)
+    _residual(stamp, images, fluxes, residual)
+    chi2 = _weighted_dot(residual, residual, weight)
+    lack = fluxes.sum() - total
+    return chi2 + tie_weight * lack * lack
+
+
+@_jit
+def _weighted_dot(a, b, weight):
+    """Return sum_pixels w a b, in four sums that make a vector."""
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    blocks = a.shape[1] - a.shape[1] % 4
+    for j in range(a.shape[0]):
+        for i in range(0, blocks, 4):
+            s0 += weight[j, i] * a[j, i] * b[j, i]
+            s1 += weight[j, i + 1] * a[j, i + 1] * b[j, i + 1]
+            s2 += weight[j, i + 2] * a[j, i + 2] * b[j, i + 2]
+            s3 += weight[j, i + 3] * a[j, i + 3] * b[j, i + 3]
+        for i in range(blocks, a.shape[1]):
+            s0 += weight[j, i] * a[j, i] * b[j, i]
+    return s0 + s1 + s2 + s3
+
+
+@_jit
+def normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
+                      gradient):
+    """
+    Put the normal equations into matrix (6K, 6K) and gradient (6K,).
+
+    The unknowns are the K fluxes and five shape numbers for each Gaussian.
+    The images and the residual come from `project`.
+    """
+    images, residual = scratch[:2]
+    polynomials, columns, moments, half, block = scratch[6:]
+    n = fluxes.size
+    for k in range(n):
+        _polynomials(shapes[k], polynomials[k])
+        _moments_of_product(images[k], residual, weight, centre[0], centre[1],
+                            columns, moments)
+        for i in range(6):
+            slope = 0.0
+            for a in range(6):
+                slope += (polynomials[k, i, a]
+                          * moments[_POWER_X[a], _POWER_Y[a]])
+            gradient[_unknown(n, k, i)] = slope * (fluxes[k] if i else 1.0)
+    for k in range(n):
+        for other in range(k + 1):
+            _moments_of_product(images[k], images[other], weight, centre[0],
+                                centre[1], columns, moments)
+            _contract(polynomials[k], moments, polynomials[other], half,
+                      block)
+            _place(block, k, other, fluxes, matrix)
+            matrix[k, other] += tie[1]
+            matrix[other, k] = matrix[k, other]
+
+
+@_jit
+def _unknown(n, k, i):
+    """Return where number i (0: flux) of Gaussian k of n is stored."""
+    return k if i == 0 else n + 5 * k + i - 1
+
+
+@_jit
+def _place(block, k, other, fluxes, matrix):
+    """Write the 6x6 block of two Gaussians into the normal matrix."""
+    n = fluxes.size
+    for i in range(6):
+        row = _unknown(n, k, i)
+        scale = fluxes[k] if i else 1.0
+        for j in range(6):
+            column = _unknown(n, other, j)
+            value = scale * block[i, j] * (fluxes[other] if j else 1.0)
+            matrix[row, column] = value
+            matrix[column, row] = value
+
+
+@_jit
+def add_penalties(shapes, limits, matrix, gradient):
+    """Add the limits to the normal equations; return their price."""
+    n = shapes.shape[0]
+    price = 0.0
+    for k in range(n):
+        first = n + 5 * k
+        price += penalty(shapes[k], limits,
+                          matrix[first:first + 5, first:first + 5],
+                          gradient[first:first + 5])
+    return price
+
+
+@_jit
+def _step(matrix, gradient, fluxes, damping, fixed_means, factor, step):
+    """
+    Put the damped step of all unknowns into step (6K,).
+
+    The fluxes are not damped. A Gaussian without flux stands still. Returns
+    the predicted decrease of the cost.
+    """
+    n = fluxes.size
+    size = gradient.size
+    floor = 0.0
+    for i in range(n, size):
+        floor = max(floor, matrix[i, i])
+    for i in range(size):
+        k = i if i < n else (i - n) // 5
+        still = fluxes[k] == 0 or (fixed_means and i >= n
+                                   and (i - n) % 5 < 2)
+        step[i] = 0.0 if still else gradient[i]
+        for j in range(i):
+            other = j if j < n else (j - n) // 5
+            factor[i, j] = (0.0 if still or fluxes[other] == 0
+                            else matrix[i, j])
+        factor[i, i] = matrix[i, i]
+        if i >= n:
+            factor[i, i] += damping * (matrix[i, i] + 1e-9 * floor)
+        if still:
+            factor[i, i] = 1.0
+    if fixed_means:
+        _uncouple_means(n, factor)
+    _factor(factor, size)
+    _solve_factored(factor, size, step)
+    gain = 0.0
+    for i in range(n, size):
+        gain += step[i] * (gradient[i] + damping * step[i]
+                           * (matrix[i, i] + 1e-9 * floor))
+    return gain
+
+
+@_jit
+def _uncouple_means(n, factor):
+    for k in range(n):
+        for c in range(2):
+            i = n + 5 * k + c
+            for j in range(i + 1, factor.shape[0]):
+                factor[j, i] = 0.0
+
+
+@_jit
+def _move(shapes, step, out):
+    """Put shapes moved by the step into out, no width by more than e-fold."""
+    n = shapes.shape[0]
+    for k in range(n):
+        for i in range(5):
+            change = step[n + 5 * k + i]
+            if i == 2 or i == 4:
+                change = min(max(change, -1.0), 1.0)
+            out[k, i] = shapes[k, i] + change
+
+
+@_jit
+def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed,
+               fixed_means, limits, tolerance, max_steps, scratch, matrices,
+               vectors):
+    """
+    Fit K Gaussians to a stamp by Levenberg-Marquardt, in place.
+
+    Parameters
+    ----------
+    stamp, weight : (ny, nx)
+        Pixels and their weights; a weight of 0 leaves a pixel out, whatever
+        finite number is in it.
+    centre : (2,)
+        The pixel x, y to which the means are relative.
+    shapes, fluxes : (K, 5), (K,)
+        Where to start (the fluxes are only written), and the result.
+    tie : (2,)
+        The total flux and the weight of that condition (0: free).
+    signed, fixed_means : bool
+        Whether fluxes may be negative; whether means stay as they are.
+    limits : (5,)
+        See `penalty`.
+    tolerance, max_steps
+        Stop when two steps running lower the cost by less than this fraction,
+        or after so many steps.
+    scratch, matrices, vectors
+        From `fitting.Workspace`.
+
+    Returns
+    -------
+    cost, status, steps
+    """
+    matrix, factor = matrices
+    gradient, step, trial, trial_fluxes = vectors
+    idle_matrix, idle_gradient = factor, step
+    cost = project(stamp, weight, centre, shapes, tie, signed, fluxes,
+                    scratch)
+    normal_equations(weight, centre, shapes, fluxes, tie, scratch, matrix,
+                      gradient)
+    cost += add_penalties(shapes, limits, matrix, gradient)
+    damping, growth, small = 1e-2, 2.0, 0
+    for n_steps in range(1, max_steps + 1):
+        gain = _step(matrix, gradient, fluxes, damping, fixed_means, factor,
+                     step)
+        _move(shapes, step, trial)
+        trial_cost = project(stamp, weight, centre, trial, tie, signed,
+                              trial_fluxes, scratch)
+        trial_cost += add_penalties(trial, limits, idle_matrix,
+                                     idle_gradient)
+        if not trial_cost < cost:
+            damping *= growth
+            growth *= 2
+            if damping > 1e12 or not gain > 1e-14 * cost:
+                return cost, FIT_CONVERGED, n_steps
+            continue
+        drop = cost - trial_cost
+        shapes[:] = trial
+        fluxes[:] = trial_fluxes
+        normal_equations(weight, centre, shapes, fluxes, tie, scratch,
+                          matrix, gradient)
+        add_penalties(shapes, limits, matrix, gradient)
+        small = small + 1 if drop <= tolerance * cost else 0
+        cost = trial_cost
+        if small >= 2:
+            return cost, FIT_CONVERGED, n_steps
+        quality = 2 * drop / max(gain, 1e-300) - 1
+        damping = max(damping * max(0.2, 1 - quality ** 3), 1e-15)
+        growth = 2.0
+    return cost, FIT_STOPPED, max_steps
+
+
+@_jit
+def bleed(columns, full_well):
+    """
+    Spread the charge above the full well along each column (n, ny), in place.
+
+    Half of the excess of a pixel goes each way, into the nearest pixels with
+    room; what reaches an end is lost.
+    """
+    ny = columns.shape[1]
+    excess = np.empty(ny)
+    for column in columns:
+        for j in range(ny):
+            excess[j] = 0.5 * max(0.0, column[j] - full_well)
+            column[j] = min(column[j], full_well)
+        for way in range(2):
+            carried = 0.0
+            for step in range(ny):
+                j = step if way == 0 else ny - 1 - step
+                carried += excess[j]
+                room = full_well - column[j]
+                if carried >= room:
+                    carried -= room
+                    column[j] = full_well
+                else:
+                    column[j] += carried
+                    carried = 0.0
+# Adaptive moments: the elliptical Gaussian weight W that matches what it
+# weighs, centroid to centroid and covariance M to twice the weighted one. The
+# state is x, y, M_xx, M_xy, M_yy; sums are of W times 1, u, v, uu, uv, vv over
+# the light, with (u, v) the offset from x, y.
+
+MOMENTS_CONVERGED, MOMENTS_STOPPED, MOMENTS_EMPTY, MOMENTS_DIVERGED = range(4)
+
+
+@_jit
+def _row_of(state, row):
+    """Put the Gaussian of unit peak that a state describes into row (6,)."""
+    x, y, xx, xy, yy = state
+    row[0], row[1], row[2] = 1.0, x, y
+    row[4] = xy / yy
+    row[3] = 1 / (xx - row[4] * xy)
+    row[5] = 1 / yy
+
+
+@_jit
+def _image_sums(image, used, fill, row, line, sums):
+    """
+    Sum an image under the weight of a row; unused pixels hold fill * W.
+
+    line (nx,) is scratch.
+    """
+    _, x, y, p, s, q = row
+    sums[:] = 0.0
+    for j in range(image.shape[0]):
+        v = j - y
+        if q * v * v > _LOG_NOTHING:
+            continue
+        line[:] = 0.0
+        _add_row(exp(-0.5 * q * v * v), -x - s * v, p, line)
+        s0, s1, s2 = 0.0, 0.0, 0.0
+        for i in range(line.size):
+            value = image[j, i] if used[j, i] else fill * line[i]
+            h = value * line[i]
+            u = i - x
+            s0 += h
+            s1 += h * u
+            s2 += h * u * u
+        sums[0] += s0
+        sums[1] += s1
+        sums[2] += v * s0
+        sums[3] += s2
+        sums[4] += v * s1
+        sums[5] += v * v * s0
+
+
+@_jit
+def _mixture_sums(mixture, state, sums):
+    """Integrate a mixture (K, 6: weight, x, y, xx, xy, yy) under a state."""
+    x, y, xx, xy, yy = state
+    sums[:] = 0.0
+    norm = sqrt(xx * yy - xy * xy)
+    for k in range(mixture.shape[0]):
+        weight, mx, my, sxx, sxy, syy = mixture[k]
+        a, b, c = xx + sxx, xy + sxy, yy + syy
+        determinant = a * c - b * b
+        dx, dy = mx - x, my - y
+        # (M + S)^-1 d, then M times it: the mean of the product.
+        ex = (c * dx - b * dy) / determinant
+        ey = (a * dy - b * dx) / determinant
+        h = (weight * norm / sqrt(determinant)
+             * exp(-0.5 * (dx * ex + dy * ey)))
+        u, v = xx * ex + xy * ey, xy * ex + yy * ey
+        # M (M + S)^-1 S: the covariance of the product.
+        tx, ty = (c * sxx - b * sxy) / determinant, (
+            a * sxy - b * sxx) / determinant
+        wx, wy = (c * sxy - b * syy) / determinant, (
+            a * syy - b * sxy) / determinant
+        sums[0] += h
+        sums[1] += h * u
+        sums[2] += h * v
+        sums[3] += h * (xx * tx + xy * ty + u * u)
+        sums[4] += h * (xx * wx + xy * wy + u * v)
+        sums[5] += h * (xy * wx + yy * wy + v * v)
+
+
+@_jit
+def _adapt(state, sums, largest):
+    """
+    Move the state towards the match; return its relative change.
+
+    If the light is a Gaussian of covariance S the weighted covariance C
+    obeys C^-1 = M^-1 + S^-1 and the centroid moves by C S^-1 of the way, so
+    S and the centre follow in one step. A negative value is a failure.
+    """
+    if not sums[0] > 0:
+        return -1.0
+    xx, xy, yy = state[2:]
+    u, v = sums[1] / sums[0], sums[2] / sums[0]
+    cxx = sums[3] / sums[0] - u * u
+    cxy = sums[4] / sums[0] - u * v
+    cyy = sums[5] / sums[0] - v * v
+    determinant = cxx * cyy - cxy * cxy
+    if not (cxx > 0 and determinant > 0):
+        return -2.0
+    area = xx * yy - xy * xy
+    pxx = cyy / determinant - yy / area
+    pxy = -cxy / determinant + xy / area
+    pyy = cxx / determinant - xx / area
+    precision = pxx * pyy - pxy * pxy
+    if pxx > 0 and precision > 0.05 / area:
+        nxx, nxy, nyy = pyy / precision, -pxy / precision, pxx / precision
+    else:
+        # No Gaussian of finite size would look like this; grow carefully.
+        nxx, nxy, nyy = 4 * cxx, 4 * cxy, 4 * cyy
+    if not nxx + nyy < largest:
+        return -2.0
+    # How far the centre is: (1 + S M^-1) times the weighted offset.
+    gx = u + (nxx * (yy * u - xy * v) + nxy * (xx * v - xy * u)) / area
+    gy = v + (nxy * (yy * u - xy * v) + nyy * (xx * v - xy * u)) / area
+    size = xx + yy
+    change = max(abs(nxx - xx), abs(nxy - xy), abs(nyy - yy)) / size
+    step = sqrt((gx * gx + gy * gy) / size)
+    change = max(change, step)
+    shrink = min(1.0, 2 / step) if step > 0 else 1.0
+    state[0] += shrink * gx
+    state[1] += shrink * gy
+    state[2], state[3], state[4] = nxx, nxy, nyy
+    return change
+
+
+@_jit
+def _ending(change):
+    if change == -1.0:
+        return MOMENTS_EMPTY
+    if change == -2.0:
+        return MOMENTS_DIVERGED
+    return MOMENTS_CONVERGED
+
+
+@_jit
+def adapt_to_images(images, used, states, tolerance, max_steps, largest,
+                    sums, status):
+    """
+    Bring the states (n, 5) to the adaptive moments of images (n, ny, nx).
+
+    used tells which pixels count; the others are filled with the matching
+    Gaussian. sums (n, 6) receives the last sums, status (n,) how it ended.
+    """
+    row = np.empty(6)
+    line = np.empty(images.shape[2])
+    for i in range(images.shape[0]):
+        state = states[i]
+        fill = 0.0
+        status[i] = MOMENTS_STOPPED
+        for _ in range(max_steps):
+            _row_of(state, row)
+            _image_sums(images[i], used[i], fill, row, line, sums[i])
+            area = state[2] * state[4] - state[3] * state[3]
+            fill = sums[i, 0] / (np.pi * sqrt(area))
+            change = _adapt(state, sums[i], largest)
+            if change < tolerance:
+                status[i] = _ending(change)
+                break
+
+
+@_jit
+def adapt_to_mixtures(mixtures, states, tolerance, max_steps, largest, sums,
+                      status):
+    """Bring the states (n, 5) to the moments of mixtures (n, K, 6)."""
+    for i in range(mixtures.shape[0]):
+        status[i] = MOMENTS_STOPPED
+        for _ in range(max_steps):
+            _mixture_sums(mixtures[i], states[i], sums[i])
+            change = _adapt(states[i], sums[i], largest)
+            if change < tolerance:
+                status[i] = _ending(change)
+                break
+# Fits of stars: flux, x and y of each, by Levenberg-Marquardt.
+#
+# A group of n stars is fitted jointly on the pixels of its n boxes, (first
+# row, first column, height, width) each; a single star is a group of one.
+# Where boxes overlap their pixels count once for each box. Parameters are
+# ordered flux, x, y of the first star, of the second, ..., and last, where it
+# is fitted, the sky level common to the group.
+
+# Outcome of a fit; 1 to 4 as scipy.optimize.least_squares counts them.
+_NOT_CONVERGED = 0
+_CONVERGED = 3
+_STALLED = 2
+_BAD_ERROR = -1
+
+# Stars whose unit-flux image is nowhere above this in a box are left out of
+# its normal matrix (not of its model).
+_UNSEEN = 1e-18
+
+# Fits stop when the next step is expected to be below this, in pixels and as
+# a fraction of the flux.
+_STEP_TOLERANCE = 1e-6
+
+
+# The PSF of a star and its derivatives by position are summed in a tile, one
+# flat array: for each pixel column _LANES values of the PSF, as many of its
+# derivative by x_0, and as many by y_0. Neighbouring rows are neighbours in
+# memory and fixed offsets lie between the parts, so that the compiler works on
+# several rows at once.
+_LANES = 32
+
+
+@_jit
+def paces(nodes, out):
+    """
+    Put the constant factors of walks over Gaussians into out (M, K, 4).
+
+    The precision along y at fixed x; how the quotient of columns grows from
+    row to row; how the quotients of rows, and of columns, fall.
+    """
+    for m in range(nodes.shape[0]):
+        for k in range(nodes.shape[1]):
+            _, _, _, p, s, q = nodes[m, k]
+            t = q + s * s * p
+            out[m, k, 0] = t
+            out[m, k, 1] = exp(p * s)
+            out[m, k, 2] = exp(-t)
+            out[m, k, 3] = exp(-p)
+
+
+@_jit
+def _walk_starts(a, dx, dy, p, s, q, pace, w, wy, height, walk):
+    """
+    Put what a walk along the columns starts from into walk (4, _LANES) flat.
+
+    For each row the Gaussian in the first column, its quotient with the next
+    one, p u, and the factor of the Gaussian in its derivative by y. Returns
+    whether anything is there. The values of the first column are a Gaussian
+    in y, walked outward from its peak. pace is as of `paces`.
+    """
+    t, grow, drop, _ = pace
+    u = dx
+    slope = q * dy - p * s * u
+    top = min(max(int(np.rint(-slope / t)), 0), height - 1)
+    u -= s * top
+    slope += t * top
+    first = a * exp(-0.5 * (p * u * u + q * (dy + top) ** 2))
+    if abs(first) < _NOTHING:
+        return False
+    g = first
+    r = exp(-slope - 0.5 * t)
+    for j in range(top, height):
+        walk[j] = g
+        g *= r
+        r *= drop
+    g = first
+    r = exp(slope - 0.5 * t)
+    for j in range(top - 1, -1, -1):
+        g *= r
+        r *= drop
+        walk[j] = g
+    r = exp(-p * (dx + 0.5))
+    for j in range(height):
+        walk[_LANES + j] = r
+        r *= grow
+    for j in range(height):
+        walk[2 * _LANES + j] = p * (dx - s * j)
+        walk[3 * _LANES + j] = w * q * (dy + j) + wy
+>>>>>>> main
     return True
 
 
 @_jit
+<<<<<<< HEAD
 def _factor_inverse_columns(a, n, first, count, out):
     """
     Put columns first, ... of inverse(L L^T) into out[:n, :count].
@@ -1103,3 +2400,862 @@ def star_quality(flux, x, y, left, bottom, width, offset, jets, weight,
             out[i, 3] = residual[row, column]
         out[i, 4] = min(own / total, 1.0) if total > 0 else np.nan
         out[i, 5] = seen / power if power > 0 else 0.0
+=======
+def _add_walk(p, s, fall, w, wx, height, width, walk, tile):
+    """Add a Gaussian to a tile, two multiplications a pixel."""
+    for i in range(width):
+        column = 3 * _LANES * i
+        pi = p * i
+        for j in range(height):
+            g = walk[j]
+            r = walk[_LANES + j]
+            h = (walk[2 * _LANES + j] + pi) * g
+            tile[column + j] += w * g
+            tile[column + _LANES + j] += w * h + wx * g
+            tile[column + 2 * _LANES + j] += (
+                walk[3 * _LANES + j] * g - w * s * h)
+            walk[j] = g * r
+            walk[_LANES + j] = r * fall
+
+
+@_jit
+def _add_pixel(g, by_x, by_y, w, wx, wy, i, j, tile):
+    """Add a Gaussian and its derivatives in one pixel, weighted."""
+    k = 3 * _LANES * i + j
+    tile[k] += w * g
+    tile[k + _LANES] += w * by_x + wx * g
+    tile[k + 2 * _LANES] += w * by_y + wy * g
+
+
+@_jit
+def _add_points(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
+                tile):
+    """Add a Gaussian to a tile, each pixel for itself."""
+    for i in range(width):
+        for j in range(height):
+            u, v = dx + i, dy + j
+            g = a * _value(u, v, p, s, q, integrated)
+            gx, gy = _gradient(u, v, p, s, q, integrated)
+            _add_pixel(g, -a * gx, -a * gy, w, wx, wy, i, j, tile)
+
+
+@_jit
+def _add_gaussian(a, dx, dy, p, s, q, pace, w, wx, wy, integrated, height,
+                  width, walk, tile):
+    """
+    Add a Gaussian, its first pixel at (dx, dy) from the peak, to a tile.
+
+    w is its share in the blend, wx and wy the slopes of the share.
+    """
+    left = min(dx - s * dy, dx - s * (dy + height - 1))
+    # A walk that begins too far out begins at zero.
+    steep = (p > 50 or q > 50 or p * abs(s) * height > 200
+             or (left < 0 and p * left * left > 600))
+    if integrated or steep:
+        _add_points(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
+                    tile)
+    elif _walk_starts(a, dx - s * dy, dy, p, s, q, pace, w, wy, height, walk):
+        _add_walk(p, s, pace[3], w, wx, height, width, walk, tile)
+
+
+@_jit
+def _fill_jet(x_0, y_0, box, psf, tiling, jet):
+    """
+    Put the unit-flux PSF in a box and its derivatives by x_0 and y_0.
+
+    They go into jet (3, width * height), column after column. psf is (nodes,
+    paces, x_grid, y_grid, integrated), tiling is scratch (walk, tile, index,
+    weights). The change of the blend with position is included.
+    """
+    nodes, paces, x_grid, y_grid, integrated = psf
+    walk, tile, index, weights = tiling
+    blend_weights(x_0, y_0, x_grid, y_grid, index, weights)
+    row, column, height, width = box
+    for bottom in range(0, height, _LANES):
+        rows = min(_LANES, height - bottom)
+        tile[:3 * _LANES * width] = 0.0
+        for corner in range(4):
+            w, wx, wy = (weights[0, corner], weights[1, corner],
+                         weights[2, corner])
+            if w == 0 and wx == 0 and wy == 0:
+                continue
+            for k in range(nodes.shape[1]):
+                a, mx, my, p, s, q = nodes[index[corner], k]
+                if a != 0:
+                    _add_gaussian(a, column - x_0 - mx,
+                                  row + bottom - y_0 - my, p, s, q,
+                                  paces[index[corner], k], w, wx, wy,
+                                  integrated, rows, width, walk, tile)
+        for part in range(3):
+            for i in range(width):
+                k = (3 * i + part) * _LANES
+                to = i * height + bottom
+                for j in range(rows):
+                    jet[part, to + j] = tile[k + j]
+
+
+@_jit
+def count_pixels(mask, boxes, out):
+    """Put the number of pixels of each box that mask leaves into out (n,)."""
+    for i in range(boxes.shape[0]):
+        row, column, height, width = boxes[i]
+        n = 0
+        for y in range(row, row + height):
+            for x in range(column, column + width):
+                n += not mask[y, x]
+        out[i] = n
+
+
+@_jit
+def _gather(image, error, mask, box, sky, data, variance):
+    """
+    Copy the pixels of a box less its sky, column after column.
+
+    Masked pixels get an infinite variance. error and mask may be empty, for
+    1 and none. Returns the number of pixels, or -1 if an error is not
+    positive and finite.
+    """
+    row, column, height, width = box
+    n = 0
+    for i in range(width):
+        for j in range(height):
+            k = i * height + j
+            y, x = row + j, column + i
+            if mask.size and mask[y, x]:
+                data[k] = 0.0
+                variance[k] = np.inf
+                continue
+            data[k] = image[y, x] - sky
+            variance[k] = 1.0
+            n += 1
+            if error.size:
+                sigma = error[y, x]
+                if not 0 < sigma < np.inf:
+                    return -1
+                variance[k] = sigma * sigma
+    return n
+
+
+@_jit
+def _weigh(data, variance, sky, gain, old, residual, weight, chi2):
+    """
+    Turn the model of the stars in residual into residuals, and weigh them.
+
+    weight takes the new weights; chi2 (2,) gets the sums of squares with the
+    old weights and with the new ones added. A gain of 0 means that variance
+    does not depend on the model.
+    """
+    with_old = 0.0
+    with_new = 0.0
+    for i in range(data.size):
+        model = residual[i]
+        v = variance[i]
+        if gain > 0 and model > 0:
+            v += model / gain
+        w = 1 / v
+        r = data[i] - sky - model
+        weight[i] = w
+        residual[i] = r
+        with_old += old[i] * r * r
+        with_new += w * r * r
+    chi2[0] += with_old
+    chi2[1] += with_new
+
+
+@_jit
+def _add_gradient(jet, flux, weight, residual, gradient):
+    """Add a star's part of the right-hand side in one box."""
+    b0 = 0.0
+    b1 = 0.0
+    b2 = 0.0
+    for i in range(weight.size):
+        wr = weight[i] * residual[i]
+        b0 += wr * jet[0, i]
+        b1 += wr * jet[1, i]
+        b2 += wr * jet[2, i]
+    gradient[0] += b0
+    gradient[1] += flux * b1
+    gradient[2] += flux * b2
+
+
+@_jit
+def _add_block(one, flux_1, two, flux_2, weight, block):
+    """Add the 3 x 3 block of the normal matrix that joins two stars."""
+    a00 = 0.0
+    a01 = 0.0
+    a02 = 0.0
+    a10 = 0.0
+    a11 = 0.0
+    a12 = 0.0
+    a20 = 0.0
+    a21 = 0.0
+    a22 = 0.0
+    for i in range(weight.size):
+        w0 = weight[i] * one[0, i]
+        w1 = weight[i] * one[1, i]
+        w2 = weight[i] * one[2, i]
+        t0, t1, t2 = two[0, i], two[1, i], two[2, i]
+        a00 += w0 * t0
+        a01 += w0 * t1
+        a02 += w0 * t2
+        a10 += w1 * t0
+        a11 += w1 * t1
+        a12 += w1 * t2
+        a20 += w2 * t0
+        a21 += w2 * t1
+        a22 += w2 * t2
+    block[0, 0] += a00
+    block[0, 1] += flux_2 * a01
+    block[0, 2] += flux_2 * a02
+    block[1, 0] += flux_1 * a10
+    block[1, 1] += flux_1 * flux_2 * a11
+    block[1, 2] += flux_1 * flux_2 * a12
+    block[2, 0] += flux_1 * a20
+    block[2, 1] += flux_1 * flux_2 * a21
+    block[2, 2] += flux_1 * flux_2 * a22
+
+
+@_jit
+def _add_sky(jet, flux, weight, column):
+    """Add what joins a star and the sky level, in one box."""
+    for i in range(weight.size):
+        column[0] += weight[i] * jet[0, i]
+        column[1] += weight[i] * jet[1, i] * flux
+        column[2] += weight[i] * jet[2, i] * flux
+
+
+@_jit
+def _model_stars(parameters, n, box, psf, scratch, residual):
+    """
+    Put the sum of n stars in a box into residual.
+
+    Fills each star's jet, and whether any of it is seen in the box. scratch
+    is (jets, seen, tiling).
+    """
+    jets, seen, tiling = scratch
+    residual[:] = 0.0
+    for s in range(n):
+        jet = jets[s, :, :residual.size]
+        _fill_jet(parameters[3 * s + 1], parameters[3 * s + 2], box, psf,
+                  tiling, jet)
+        flux = parameters[3 * s]
+        top = 0.0
+        for i in range(residual.size):
+            residual[i] += flux * jet[0, i]
+            top = max(top, abs(jet[0, i]))
+        seen[s] = top > _UNSEEN
+
+
+@_jit
+def _add_equations(parameters, n, fit_sky, jets, seen, weight, residual,
+                   matrix, gradient):
+    """Add what one box contributes to the normal equations of a group."""
+    sky = 3 * n
+    for s in range(n):
+        if not seen[s]:
+            continue
+        flux = parameters[3 * s]
+        one = slice(3 * s, 3 * s + 3)
+        own = jets[s, :, :weight.size]
+        _add_gradient(own, flux, weight, residual, gradient[one])
+        for t in range(s + 1):
+            if seen[t]:
+                _add_block(own, flux, jets[t, :, :weight.size],
+                           parameters[3 * t], weight,
+                           matrix[one, 3 * t:3 * t + 3])
+        if fit_sky:
+            _add_sky(own, flux, weight, matrix[sky, one])
+    if fit_sky:
+        for i in range(weight.size):
+            matrix[sky, sky] += weight[i]
+            gradient[sky] += weight[i] * residual[i]
+
+
+@_jit
+def _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
+                      chi2):
+    """
+    Evaluate a group: normal matrix and right-hand side, chi2 (2,).
+
+    pixels is (boxes, data, variance, gain). old and new are the tuples
+    (weights, residuals, matrix, gradient) of the last point and of this one.
+    Only the lower triangle of the matrix is filled.
+    """
+    boxes, data, variance, gain = pixels
+    jets, seen, _ = scratch
+    weights, residuals, matrix, gradient = new
+    size = 3 * n + fit_sky
+    matrix[:size, :size] = 0.0
+    gradient[:size] = 0.0
+    chi2[:] = 0.0
+    sky = parameters[3 * n] if fit_sky else 0.0
+    for c in range(n):
+        used = boxes[c, 2] * boxes[c, 3]
+        residual, weight = residuals[c, :used], weights[c, :used]
+        _model_stars(parameters, n, boxes[c], psf, scratch, residual)
+        _weigh(data[c, :used], variance[c, :used], sky, gain,
+               old[0][c, :used], residual, weight, chi2)
+        _add_equations(parameters, n, fit_sky, jets, seen, weight, residual,
+                       matrix, gradient)
+
+
+@_jit
+def _factorize(matrix, frozen, damping, size, scale, factor):
+    """
+    Put the Cholesky factor of the damped, scaled matrix into factor.
+
+    scale (size,) takes the square roots of the diagonal; rows of frozen
+    parameters become those of the unit matrix. Returns whether the matrix is
+    positive definite to working precision.
+    """
+    for a in range(size):
+        d = matrix[a, a]
+        if frozen[a] or not d > 0:
+            frozen[a] = True
+            scale[a] = 1.0
+        else:
+            scale[a] = sqrt(d)
+    for a in range(size):
+        for b in range(a + 1):
+            if frozen[a] or frozen[b]:
+                value = 1.0 if a == b else 0.0
+            else:
+                value = matrix[a, b] / (scale[a] * scale[b])
+                if a == b:
+                    value += damping
+            for c in range(b):
+                value -= factor[a, c] * factor[b, c]
+            if a == b:
+                if not value > 1e-14:
+                    return False
+                factor[a, a] = sqrt(value)
+            else:
+                factor[a, b] = value / factor[b, b]
+    return True
+
+
+@_jit
+def _solve(factor, scale, size, vector):
+    """Solve for the scaled vector in place, given the Cholesky factor."""
+    for a in range(size):
+        value = vector[a] / scale[a]
+        for b in range(a):
+            value -= factor[a, b] * vector[b]
+        vector[a] = value / factor[a, a]
+    for a in range(size - 1, -1, -1):
+        value = vector[a]
+        for b in range(a + 1, size):
+            value -= factor[b, a] * vector[b]
+        vector[a] = value / factor[a, a]
+    for a in range(size):
+        vector[a] /= scale[a]
+
+
+@_jit
+def _freeze(parameters, lower, upper, gradient, fixed, size, frozen):
+    """Freeze fixed parameters and those that press against a bound."""
+    for a in range(size):
+        frozen[a] = fixed[a] or (
+            parameters[a] <= lower[a] and gradient[a] < 0) or (
+            parameters[a] >= upper[a] and gradient[a] > 0)
+
+
+@_jit
+def _step_size(step, parameters, matrix, n):
+    """
+    Return the largest relative step of a group.
+
+    In pixels for positions; for fluxes as a fraction of the flux or, if that
+    is larger, of a tenth of its error.
+    """
+    size = 0.0
+    for s in range(n):
+        a = 3 * s
+        size = max(size, abs(step[a + 1]), abs(step[a + 2]))
+        if step[a] != 0:
+            noise = 0.1 / sqrt(matrix[a, a])
+            size = max(size, abs(step[a]) / max(abs(parameters[a]), noise))
+    return size
+
+
+@_jit
+def _take_step(parameters, step, lower, upper, n, size, longest, trial):
+    """Put the bounded end of the step into trial, the actual into step."""
+    for s in range(n):
+        far = max(abs(step[3 * s + 1]), abs(step[3 * s + 2]))
+        if far > longest:
+            step[3 * s + 1] *= longest / far
+            step[3 * s + 2] *= longest / far
+    for a in range(size):
+        trial[a] = min(max(parameters[a] + step[a], lower[a]), upper[a])
+        step[a] = trial[a] - parameters[a]
+
+
+@_jit
+def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
+              limits, max_iterations, longest, chi2):
+    """
+    Minimize chi2 of a group by Levenberg-Marquardt, from parameters.
+
+    Returns the outcome and the number of evaluations; old holds the
+    equations at the result, chi2[1] its sum of squares. work is (step,
+    trial, frozen, scale, factor), limits (lower, upper, fixed).
+    """
+    step, trial, frozen, scale, factor = work
+    lower, upper, fixed = limits
+    size = 3 * n + fit_sky
+    _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, old,
+                      chi2)
+    best = chi2[1]
+    floor = 1e-24 * best
+    damping = 0.0
+    last = 1.0
+    for iteration in range(max_iterations):
+        _freeze(parameters, lower, upper, old[3], fixed, size, frozen)
+        if not _factorize(old[2], frozen, damping, size, scale, factor):
+            damping = max(10 * damping, 1e-6)
+            if damping > 1e3:
+                return _NOT_CONVERGED, iteration + 1
+            continue
+        for a in range(size):
+            step[a] = 0.0 if frozen[a] else old[3][a]
+        _solve(factor, scale, size, step)
+        _take_step(parameters, step, lower, upper, n, size, longest, trial)
+        length = _step_size(step, parameters, old[2], n)
+        _normal_equations(trial, n, fit_sky, pixels, psf, scratch, old, new,
+                          chi2)
+        if not chi2[0] <= best * (1 + 1e-12) + floor:
+            if length < 1e-3 * _STEP_TOLERANCE or damping > 1e12:
+                return _STALLED, iteration + 2
+            damping = max(10 * damping, 1e-3)
+            last = 1.0
+            continue
+        parameters[:size] = trial[:size]
+        best = chi2[1]
+        for source, target in ((new[0], old[0]), (new[1], old[1])):
+            target[:n] = source[:n]
+        old[2][:size, :size] = new[2][:size, :size]
+        old[3][:size] = new[3][:size]
+        # Convergence is linear at the worst: the next step is expected to
+        # be shorter than this one by the factor this one was.
+        if damping == 0 and length * min(1.0, length / last) < _STEP_TOLERANCE:
+            return _CONVERGED, iteration + 2
+        last = length
+        damping = damping / 10 if damping > 1e-5 else 0.0
+    return _NOT_CONVERGED, max_iterations + 1
+
+
+@_jit
+def _covariances(matrix, fixed, n, size, work, out):
+    """
+    Put each star's 3 x 3 block of the inverse matrix into out (n, 3, 3).
+
+    Returns the variance of the last parameter, or NaN if there is no inverse;
+    then out is NaN, too.
+    """
+    step, _, frozen, scale, factor = work
+    for a in range(size):
+        frozen[a] = fixed[a]
+    if not _factorize(matrix, frozen, 0.0, size, scale, factor):
+        out[:n] = np.nan
+        return np.nan
+    for a in range(size):
+        step[:size] = 0.0
+        step[a] = 1.0
+        _solve(factor, scale, size, step)
+        if a < 3 * n:
+            s = a // 3
+            for b in range(3):
+                out[s, a - 3 * s, b] = step[3 * s + b]
+                if frozen[a] or frozen[3 * s + b]:
+                    out[s, a - 3 * s, b] = np.nan
+    return step[size - 1]
+
+
+@_jit
+def _measure_fit(x_init, y_init, boxes, weights, residuals, n, out):
+    """
+    Put three sums of each star's box into out (n, 3).
+
+    They are the sum of absolute residuals, the residual of the pixel at the
+    initial position, NaN where it was not fitted, and the sum of squares.
+    """
+    for s in range(n):
+        row, column, height, width = boxes[s]
+        total = 0.0
+        squares = 0.0
+        for i in range(height * width):
+            if weights[s, i] > 0:
+                total += abs(residuals[s, i])
+                squares += weights[s, i] * residuals[s, i] ** 2
+        x = ceil(x_init[s] - 0.5) - column
+        y = ceil(y_init[s] - 0.5) - row
+        centre = np.nan
+        if 0 <= x < width and 0 <= y < height and weights[
+                s, x * height + y] > 0:
+            centre = residuals[s, x * height + y]
+        out[s, 0] = total
+        out[s, 1] = centre
+        out[s, 2] = squares
+
+
+@_jit
+def _load_group(image, error, mask, stars, fixed, parameters, limits, data,
+                variance):
+    """
+    Fetch the pixels, initial values and limits of one group.
+
+    stars is (boxes, initial, sky, lower, upper). Returns the number of
+    pixels, or -1 if an error is not positive and finite.
+    """
+    boxes, initial, sky, lower, upper = stars
+    n = boxes.shape[0]
+    n_pixels = 0
+    for s in range(n):
+        got = _gather(image, error, mask, boxes[s], sky[s], data[s],
+                      variance[s])
+        if got < 0:
+            return -1
+        n_pixels += got
+        for b in range(3):
+            a = 3 * s + b
+            limits[0][a], limits[1][a] = lower[s, b], upper[s, b]
+            limits[2][a] = fixed[b]
+            parameters[a] = min(max(initial[s, b], lower[s, b]), upper[s, b])
+    parameters[3 * n] = 0.0
+    limits[0][3 * n], limits[1][3 * n] = -np.inf, np.inf
+    limits[2][3 * n] = False
+    return n_pixels
+
+
+@_jit
+def _scatter(sums, n_pixels, n_free):
+    """Return the variance of residuals, NaN without degrees of freedom."""
+    return sums[:, 2].sum() / (n_pixels - n_free) if (
+        n_pixels > n_free) else np.nan
+
+
+@_jit
+def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
+              fixed, fit_sky, gain, psf, max_iterations, fitted, fitted_sky,
+              covariances, sums, outcome):
+    """
+    Fit flux, x and y of groups of stars.
+
+    The stars of group g are starts[g] to starts[g + 1]. initial, lower and
+    upper are (n, 3); fixed (3,) holds for all; sky (n,) is subtracted before
+    the fit, and fit_sky adds one level for each group. error and mask may be
+    empty; without errors the scatter of the residuals stands for them.
+    Results: fitted (n, 3), fitted_sky (n, 2) with its error, covariances
+    (n, 3, 3), sums (n, 3) as of _measure_fit, outcome (n, 2) with the number
+    of evaluations.
+    """
+    most = np.max(np.diff(starts)) if starts.size > 1 else 1
+    area = np.max(boxes[:, 2] * boxes[:, 3]) if boxes.size else 1
+    size = 3 * most + 1
+    data, variance = np.empty((most, area)), np.empty((most, area))
+    old = (np.zeros((most, area)), np.empty((most, area)),
+           np.empty((size, size)), np.empty(size))
+    new = (np.zeros((most, area)), np.empty((most, area)),
+           np.empty((size, size)), np.empty(size))
+    tiling = (np.empty(4 * _LANES), np.empty(3 * _LANES * area),
+              np.empty(4, np.int64), np.empty((3, 4)))
+    scratch = (np.empty((most, 3, area)), np.empty(most, np.bool_), tiling)
+    work = (np.empty(size), np.empty(size), np.empty(size, np.bool_),
+            np.empty(size), np.empty((size, size)))
+    limits = (np.empty(size), np.empty(size), np.empty(size, np.bool_))
+    parameters, chi2 = np.empty(size), np.empty(2)
+    for g in range(starts.size - 1):
+        n = starts[g + 1] - starts[g]
+        stars = slice(starts[g], starts[g + 1])
+        n_pixels = _load_group(
+            image, error, mask, (boxes[stars], initial[stars], sky[stars],
+                                 lower[stars], upper[stars]),
+            fixed, parameters, limits, data, variance)
+        if n_pixels < 0:
+            outcome[stars, 0] = _BAD_ERROR
+            continue
+        longest = max(1.0, 0.25 * np.max(boxes[stars, 2:]))
+        pixels = (boxes[stars], data, variance, gain)
+        status, evaluations = _minimize(
+            parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
+            limits, max_iterations, longest, chi2)
+        sky_variance = _covariances(old[2], limits[2], n, 3 * n + fit_sky,
+                                    work, covariances[stars])
+        _measure_fit(initial[stars, 1], initial[stars, 2], boxes[stars],
+                     old[0], old[1], n, sums[stars])
+        factor = 1.0
+        if error.size == 0 and gain == 0:
+            factor = _scatter(sums[stars], n_pixels,
+                              n * np.sum(~fixed) + fit_sky)
+        covariances[stars] *= factor
+        for s in range(n):
+            for b in range(3):
+                fitted[starts[g] + s, b] = parameters[3 * s + b]
+        if fit_sky:
+            fitted_sky[stars, 0] = parameters[3 * n]
+            fitted_sky[stars, 1] = sqrt(factor * sky_variance)
+        outcome[stars, 0] = status
+        outcome[stars, 1] = evaluations
+
+
+# A field of mixtures fitted to the stamps of n stars.
+#
+# shapes (K, 6) are the numbers that vary over the detector: log weight, x, y,
+# log_p, s, log_q with p = exp(2 log_p), q = exp(2 log_q), so that any values
+# are a valid mixture. The first three of the first Gaussian are never fitted:
+# they would repeat the flux and the position of the stars.
+#
+# sources (M, 3) are x, y and flux of a star and of the neighbours in its
+# stamp, of which the first n_sources count. In the normal equations of one
+# stamp come first the Q numbers of its own, then the 6 K - 3 shapes, then the
+# residual, all in one triangle: eliminating the first Q is a Schur complement
+# that leaves the equations of the shapes, their right side and chi^2.
+
+_TWO_PI = 2 * np.pi
+
+
+@_jit
+def shape_rows(shapes, rows):
+    """Put the rows that other kernels take into rows (K, 6)."""
+    for k in range(shapes.shape[0]):
+        a, mx, my, log_p, s, log_q = shapes[k]
+        rows[k, 0] = exp(a + log_p + log_q) / _TWO_PI
+        rows[k, 1] = mx
+        rows[k, 2] = my
+        rows[k, 3] = exp(2 * log_p)
+        rows[k, 4] = s
+        rows[k, 5] = exp(2 * log_q)
+
+
+@_jit
+def _design(x, y, rows, sources, n_sources, first, row):
+    """
+    Put derivatives of a pixel into row and return the model.
+
+    Those by the shapes are added from index ``first`` on, unless it is
+    negative.
+    """
+    model = 0.0
+    for j in range(n_sources):
+        flux = sources[j, 2]
+        value = 0.0
+        gx = 0.0
+        gy = 0.0
+        for k in range(rows.shape[0]):
+            a, mx, my, p, s, q = rows[k]
+            dx = x - sources[j, 0] - mx
+            dy = y - sources[j, 1] - my
+            u = dx - s * dy
+            pu = p * u
+            qy = q * dy
+            exponent = pu * u + qy * dy
+            if not exponent < _LOG_NOTHING:
+                continue
+            g = a * exp(-0.5 * exponent)
+            by_x = pu * g
+            by_y = qy * g - s * by_x
+            value += g
+            gx += by_x
+            gy += by_y
+            if first >= 0:
+                _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy,
+                                       first + 6 * k - 3, k > 0, row)
+        row[3 * j] = flux * gx
+        row[3 * j + 1] = flux * gy
+        row[3 * j + 2] = value
+        model += flux * value
+    return model
+
+
+@_jit
+def _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy, at, moves,
+                           row):
+    fg = flux * g
+    if moves:
+        row[at] += fg
+        row[at + 1] += flux * by_x
+        row[at + 2] += flux * by_y
+    row[at + 3] += fg * (1 - pu * u)
+    row[at + 4] += fg * pu * dy
+    row[at + 5] += fg * (1 - qy * dy)
+
+
+@_jit
+def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
+                fit_sky, with_shapes, row, normal):
+    """
+    Sum the normal equations of a stamp into normal; return their size.
+
+    The size includes the column of the residual.
+    """
+    own = 3 * n_sources + fit_sky
+    size = own + 1
+    first = -1
+    if with_shapes:
+        size += 6 * rows.shape[0] - 3
+        first = own
+    normal[:size, :size] = 0.0
+    for j in range(stamp.shape[0]):
+        for i in range(stamp.shape[1]):
+            w = weight[j, i]
+            if w <= 0:
+                continue
+            row[:size] = 0.0
+            if fit_sky:
+                row[own - 1] = 1.0
+            model = _design(left + i, bottom + j, rows, sources, n_sources,
+                            first, row)
+            row[size - 1] = stamp[j, i] - sky - model
+            for m in range(size):
+                c = w * row[m]
+                for n in range(m, size):
+                    normal[m, n] += c * row[n]
+    return size
+
+
+@_jit
+def _hold_neighbours(sources, anchors, n_sources, hold, size, normal):
+    """Add the prior of the neighbours: anchors with the precisions hold."""
+    for j in range(1, n_sources):
+        for i in range(3):
+            at = 3 * j + i
+            offset = anchors[j, i] - sources[j, i]
+            normal[at, at] += hold[j, i]
+            normal[at, size - 1] += hold[j, i] * offset
+            normal[size - 1, size - 1] += hold[j, i] * offset * offset
+
+
+@_jit
+def _eliminate(normal, n, size):
+    """Eliminate the first n unknowns from the upper triangle, in place."""
+    for k in range(n):
+        pivot = normal[k, k]
+        if not pivot > 0:
+            continue
+        for i in range(k + 1, size):
+            factor = normal[k, i] / pivot
+            if factor != 0:
+                for j in range(i, size):
+                    normal[i, j] -= factor * normal[k, j]
+
+
+@_jit
+def _back_substitute(normal, n, size, step):
+    """Solve for the first n unknowns after their elimination."""
+    for k in range(n - 1, -1, -1):
+        right = normal[k, size - 1]
+        for j in range(k + 1, n):
+            right -= normal[k, j] * step[j]
+        step[k] = right / normal[k, k] if normal[k, k] > 0 else 0.0
+
+
+@_jit
+def _settle(stamp, weight, left, bottom, rows, sources, anchors, hold,
+            n_sources, sky, fit_sky, n_steps, tolerance, row, normal, step):
+    """Fit the stamp's own numbers, its PSF given; return the sky."""
+    own = 3 * n_sources + fit_sky
+    for _ in range(n_steps):
+        size = _accumulate(stamp, weight, left, bottom, rows, sources,
+                           n_sources, sky, fit_sky, False, row, normal)
+        _hold_neighbours(sources, anchors, n_sources, hold, size, normal)
+        gain = normal[size - 1, size - 1]
+        _eliminate(normal, own, size)
+        gain -= normal[size - 1, size - 1]
+        _back_substitute(normal, own, size, step)
+        for j in range(n_sources):
+            for i in range(2):
+                # A longer step would leave the core, where linear is wrong.
+                sources[j, i] += min(max(step[3 * j + i], -0.5), 0.5)
+            sources[j, 2] += step[3 * j + 2]
+        if fit_sky:
+            sky += step[own - 1]
+        if not gain > tolerance:
+            break
+    return sky
+
+
+@_jit
+def field_normal(stamps, weights, corners, basis, coefficients, sources,
+                 anchors, hold, n_sources, sky, fit_sky, used, n_steps,
+                 tolerance, normal, total, gradient, chi2):
+    """
+    Settle n stars and add the equations of the used ones to total, gradient.
+
+    stamps, weights (n, s, s); corners (n, 2), the pixel (x, y) of each
+    stamp's first; basis (n, T); coefficients (T, K, 6); sources, anchors,
+    hold (n, M, 3); n_sources (n,); sky (n,) with fit_sky; used (n,). normal
+    is scratch (D, D) with D = 3 M + 6 K - 1. total (P T, P T), upper
+    triangle, and gradient (P T,) order unknowns by shape, then term, with
+    P = 6 K - 3. chi2 (n,).
+    """
+    k = coefficients.shape[1]
+    shapes = np.empty((k, 6))
+    rows = np.empty((k, 6))
+    row = np.empty(normal.shape[0])
+    step = np.empty(normal.shape[0])
+    spread = np.empty(gradient.size)
+    for star in range(stamps.shape[0]):
+        _shapes_at(basis[star], coefficients, shapes)
+        shape_rows(shapes, rows)
+        left, bottom = corners[star]
+        sky[star] = _settle(
+            stamps[star], weights[star], left, bottom, rows, sources[star],
+            anchors[star], hold[star], n_sources[star], sky[star], fit_sky,
+            n_steps, tolerance, row, normal, step)
+        size = _accumulate(
+            stamps[star], weights[star], left, bottom, rows, sources[star],
+            n_sources[star], sky[star], fit_sky, used[star], row, normal)
+        _hold_neighbours(sources[star], anchors[star], n_sources[star],
+                         hold[star], size, normal)
+        chi2[star] = normal[size - 1, size - 1]
+        if used[star]:
+            own = 3 * n_sources[star] + fit_sky
+            _eliminate(normal, own, size)
+            _spread(normal, own, size, basis[star], spread, total, gradient)
+
+
+@_jit
+def _shapes_at(basis, coefficients, shapes):
+    """Evaluate the polynomials, coefficients (T, K, 6), into (K, 6)."""
+    shapes[:] = 0.0
+    for t in range(basis.size):
+        if basis[t] != 0:
+            for k in range(shapes.shape[0]):
+                for i in range(6):
+                    shapes[k, i] += basis[t] * coefficients[t, k, i]
+
+
+@_jit
+def _spread(normal, own, size, basis, spread, total, gradient):
+    """Add A (x) B B^T to total, A being what is left of normal."""
+    n_terms = basis.size
+    for p in range(size - own - 1):
+        for q in range(p, size - own - 1):
+            for t in range(n_terms):
+                spread[q * n_terms + t] = normal[own + p, own + q] * basis[t]
+        right = normal[own + p, size - 1]
+        for t in range(n_terms):
+            b = basis[t]
+            if b != 0:
+                at = p * n_terms + t
+                gradient[at] += b * right
+                for j in range(p * n_terms, spread.size):
+                    total[at, j] += b * spread[j]
+
+
+@_jit
+def field_model(corners, basis, coefficients, sources, n_sources, sky, out):
+    """Put model stamps of n stars, neighbours and sky included, into out."""
+    k = coefficients.shape[1]
+    shapes = np.empty((k, 6))
+    rows = np.empty((k, 6))
+    for star in range(out.shape[0]):
+        _shapes_at(basis[star], coefficients, shapes)
+        shape_rows(shapes, rows)
+        left, bottom = corners[star]
+        out[star] = sky[star]
+        for j in range(n_sources[star]):
+            x, y, flux = sources[star, j]
+            render(rows, x - left, y - bottom, flux, False, out[star])
+>>>>>>> main

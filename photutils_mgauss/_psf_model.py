@@ -3,25 +3,13 @@ import copy
 
 import numpy as np
 from astropy.modeling import Fittable2DModel, Parameter
-from astropy.units import Quantity, UnitsError
+from astropy.units import Quantity, Unit, UnitsError
 
 from photutils_mgauss import _compat
 
 
 class PSFParameter(Parameter):
-    """A Parameter that tells its model when it is freed or fixed."""
-
-    @property
-    def fixed(self):
-        """Whether the parameter is kept fixed during fitting."""
-        return super().fixed
-
-    @fixed.setter
-    def fixed(self, value):
-        Parameter.fixed.fset(self, value)
-        model = getattr(self, '_model', None)
-        if model is not None:
-            model._refresh_identity()
+    """A Parameter that is cheap to copy."""
 
     def bound_copy(self, model):
         """Return a copy that belongs to ``model``, at a tenth of deepcopy."""
@@ -45,22 +33,23 @@ class PSFModel(Fittable2DModel):
     x_0 = PSFParameter(default=0, description='Position of the star in x.')
     y_0 = PSFParameter(default=0, description='Position of the star in y.')
 
+    # How files hold the parameters: column and unit.
+    _parameter_columns = {'name': '', 'value': '', 'unit': '', 'fixed': '',
+                          'lower': '', 'upper': ''}
+
     # In standard deviations of the widest Gaussian; 5.5 leaves out 3e-7 of
     # its flux.
     bbox_factor = 5.5
 
-    def __str__(self):
-        public = _compat.public_class(self).__name__
-        return super().__str__().replace(type(self).__name__, public)
+    if _compat.STALE_GROUP_MODELS:
+        __class__ = property(_compat.group_class)
 
-    def _refresh_identity(self):
-        # Called from Parameters while the model is still being built, too.
-        if '_ready' in self.__dict__:
-            _compat.set_identity(self, self._state)
+    def __str__(self):
+        return super().__str__().replace(self.__class__.__name__,
+                                         type(self).__name__)
 
     def _finish(self):
         self._ready = True
-        self._refresh_identity()
 
     @property
     def bounding_box(self):
@@ -109,11 +98,9 @@ class PSFModel(Fittable2DModel):
         return copy.deepcopy(self)
 
     def __reduce__(self):
-        return _new_model, (_compat.public_class(self),), self.__dict__
-
-    def __setstate__(self, state):
-        self.__dict__.update(state)
-        self._refresh_identity()
+        state = {key: value for key, value in self.__dict__.items()
+                 if key != '_group_class'}
+        return _new_model, (type(self),), state
 
     @property
     def input_units(self):
@@ -130,6 +117,31 @@ class PSFModel(Fittable2DModel):
             raise UnitsError(msg)
         lengths = dict.fromkeys(self._length_names(), x_unit)
         return {**lengths, 'flux': outputs_unit[self.outputs[0]]}
+
+    def _parameter_table(self):
+        """Return the columns of a table of parameters; NaN is no bound."""
+        parameters = [getattr(self, name) for name in self.param_names]
+        bounds = np.array([p.bounds for p in parameters], dtype=float)
+        return {'name': list(self.param_names),
+                'value': np.array([p.value for p in parameters], float),
+                'unit': [str(p.unit or '') for p in parameters],
+                'fixed': [bool(p.fixed) for p in parameters],
+                'lower': bounds[:, 0], 'upper': bounds[:, 1]}
+
+    @staticmethod
+    def _parameter_keywords(table):
+        """Return the keywords that give a new model these parameters."""
+        names = [str(name) for name in table['name']]
+        bounds = np.column_stack([table['lower'], table['upper']])
+        values = {name: float(value) * Unit(unit) if unit else float(value)
+                  for name, value, unit in zip(
+                      names, table['value'], table['unit'], strict=True)}
+        return {**values,
+                'fixed': dict(zip(names, map(bool, table['fixed']),
+                                  strict=True)),
+                'bounds': {name: tuple(None if np.isnan(b) else float(b)
+                                       for b in pair)
+                           for name, pair in zip(names, bounds, strict=True)}}
 
     def _length_names(self):
         """Return the names of the parameters that are lengths."""

@@ -11,13 +11,16 @@ weights :math:`w_n`; the PSF is the mixture of their :math:`4K` Gaussians,
 
 Outside the grid the weights are those of the nearest edge.
 """
-from dataclasses import dataclass, field
-from itertools import count
+from collections.abc import Mapping
 
 import numpy as np
-from photutils.psf import GriddedPSFModel
+from astropy.table import QTable
+from photutils.psf import GriddedPSFModel, ImagePSF
 
 from photutils_mgauss import _kernels
+from photutils_mgauss._files import storable
+from photutils_mgauss._grid import checked_arrays, make_grid, split_seams
+from photutils_mgauss._nodes import NodeImages, fit_nodes, plain_report
 from photutils_mgauss._psf_model import (
     PSFModel,
     flat_points,
@@ -25,70 +28,23 @@ from photutils_mgauss._psf_model import (
     strip_units,
     with_unit,
 )
-from photutils_mgauss._validation import as_floats, as_shape
-from photutils_mgauss.mixture import GaussianMixture, _rows
+from photutils_mgauss._validation import as_choice, as_floats, as_shape
+from photutils_mgauss.mixture import GaussianMixture
 from photutils_mgauss.model import MultiGaussianPSFModel
+from photutils_mgauss.psf_io import read_psfex
 
 __all__ = ['GriddedMixturePSF']
 
-_serial = count()
+_KERNELS = {
+    'blend': (_kernels.evaluate_grid, _kernels.differentiate_grid,
+              _kernels.render_grid),
+    'components': (_kernels.evaluate_matched, _kernels.differentiate_matched,
+                   _kernels.render_matched),
+}
+_OUTSIDE = ('clamp', 'raise', 'nan')
 
 
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    """
-    The mixtures at M = ny * nx nodes, ordered by y, then x; never changed.
-
-    Attributes
-    ----------
-    x_grid, y_grid : (nx,), (ny,) `~numpy.ndarray`
-        The node positions along each axis, ascending [pix].
-    weights, means, covariances : (M, K, ...) `~numpy.ndarray`
-        The mixtures; those of fewer Gaussians are padded with weight zero.
-    scales : (M,) `~numpy.ndarray`
-        The flux on the detector of a star of flux 1.
-    """
-
-    x_grid: np.ndarray
-    y_grid: np.ndarray
-    weights: np.ndarray
-    means: np.ndarray
-    covariances: np.ndarray
-    scales: np.ndarray
-    rows: np.ndarray = field(init=False)
-    serial: int = field(init=False)
-
-    def __post_init__(self):
-        rows = _rows(self.weights * self.scales[:, None], self.means,
-                     self.covariances)
-        object.__setattr__(self, 'rows', np.ascontiguousarray(rows))
-        object.__setattr__(self, 'serial', next(_serial))
-        for array in self.arrays:
-            array.flags.writeable = False
-
-    @property
-    def arrays(self):
-        return (self.x_grid, self.y_grid, self.weights, self.means,
-                self.covariances, self.scales)
-
-    def __reduce__(self):
-        return _Grid, self.arrays
-
-    def node(self, m):
-        """Return the mixture of node m without its padding."""
-        used = self.weights[m] != 0
-        return GaussianMixture(self.weights[m, used], self.means[m, used],
-                               self.covariances[m, used])
-
-    def neighbours(self, x, y):
-        """Return the indices and bilinear weights (4,) at a position."""
-        index, weights = np.empty(4, np.int64), np.empty((3, 4))
-        _kernels.blend_weights(float(x), float(y), self.x_grid, self.y_grid,
-                               index, weights)
-        used = weights[0] > 0
-        return index[used], weights[0, used]
-
-
+@storable
 class GriddedMixturePSF(PSFModel):
     """
     A PSF that varies over a detector: mixtures of Gaussians on a grid.
@@ -101,7 +57,9 @@ class GriddedMixturePSF(PSFModel):
     Parameters
     ----------
     mixtures : sequence of N `GaussianMixture`
-        The PSF at each node. The numbers of Gaussians may differ.
+        The PSF at each node. The numbers of Gaussians may differ. A node
+        whose mixture is None is bridged: it gets a blend of its nearest
+        neighbours.
     grid_xypos : (N, 2) array_like
         The positions (x, y) of the nodes [pix], in the order of
         ``mixtures``. They form a rectangular grid of any spacing; a single
@@ -117,6 +75,15 @@ class GriddedMixturePSF(PSFModel):
         The flux on the detector of a star of ``flux`` 1 at each node; 1 by
         default. Grids made from ePSFs keep the scale of those, so that
         fluxes agree with the ones `~photutils.psf.GriddedPSFModel` gives.
+    interpolation : {'blend', 'components'}, optional
+        How to go from node to node: ``'blend'`` adds the images of four
+        neighbours, 4 K Gaussians; ``'components'`` pairs the Gaussians of
+        neighbours and blends each pair into one, K Gaussians with the same
+        flux, centroid and second moments.
+    outside : {'clamp', 'raise', 'nan'}, optional
+        What a star outside the outermost nodes gets: the PSF of the nearest
+        edge, a ValueError, or NaN. Leave it at ``'clamp'`` for fits, which
+        may step anywhere.
     **kwargs
         Keywords of `~astropy.modeling.Model`: ``name``, ``meta``, ``fixed``,
         ``bounds``.
@@ -127,7 +94,8 @@ class GriddedMixturePSF(PSFModel):
         If ``mixtures`` holds anything but `GaussianMixture` objects.
     ValueError
         If the numbers of mixtures and positions differ, two nodes are at one
-        place, or the positions do not form a rectangular grid.
+        place, the positions do not form a rectangular grid, or weights are
+        negative and ``interpolation`` is ``'components'``.
 
     Examples
     --------
@@ -146,73 +114,268 @@ n_components=1)>
     array([0.4, 0.4, 0.1, 0.1])
     """
 
+    _columns = {
+        'model': {'name': '', 'pixel_integrated': '', 'interpolation': '',
+                  'outside': ''},
+        'parameters': PSFModel._parameter_columns,
+        'nodes': {'x': 'pix', 'y': 'pix', 'scale': '', 'weight': '',
+                  'mean': 'pix', 'covariance': 'pix2'}}
+
     def __init__(self, mixtures, grid_xypos, *, flux=1, x_0=0, y_0=0,
-                 pixel_integrated=False, scales=None, **kwargs):
-        self._grid = _make_grid(list(mixtures), grid_xypos, scales)
-        self._pixel_integrated = bool(pixel_integrated)
+                 pixel_integrated=False, scales=None, interpolation='blend',
+                 outside='clamp', **kwargs):
+        mixtures = list(mixtures)
+        grid, order = make_grid(mixtures, grid_xypos, scales)
+        self._set_up(grid, pixel_integrated, interpolation, outside)
+        self._report = plain_report(
+            grid.positions, (grid.weights != 0).sum(axis=1), grid.scales)
+        self._report['bridged'] = [mixtures[i] is None for i in order]
         super().__init__(flux=flux, x_0=x_0, y_0=y_0, **kwargs)
         self._finish()
 
+    def _set_up(self, grid, pixel_integrated, interpolation, outside):
+        self._grid = grid
+        self._pixel_integrated = bool(pixel_integrated)
+        self._interpolation = as_choice(interpolation, 'interpolation',
+                                        tuple(_KERNELS))
+        self._outside = as_choice(outside, 'outside', _OUTSIDE)
+        if interpolation == 'components' and (grid.weights < 0).any():
+            msg = ("interpolation must be 'blend' where weights are negative, "
+                   "got 'components'")
+            raise ValueError(msg)
+
+    @classmethod
+    def _from_grid(cls, grid, report=None, *, pixel_integrated=False,
+                   interpolation='blend', outside='clamp', **kwargs):
+        """Return a model of a grid that needs no checks."""
+        new = cls.__new__(cls)
+        new._set_up(grid, pixel_integrated, interpolation, outside)
+        new._report = report if report is not None else plain_report(
+            grid.positions, (grid.weights != 0).sum(axis=1), grid.scales)
+        PSFModel.__init__(new, **kwargs)
+        new._finish()
+        return new
+
     @classmethod
     def from_gridded_psf(cls, psf, n_components=3, *, radius=None,
-                         executor=None, **kwargs):
+                         executor=None, progress_bar=False, **kwargs):
         """
         Fit mixtures to the ePSFs of a photutils grid.
 
         Parameters
         ----------
         psf : `~photutils.psf.GriddedPSFModel` or `~photutils.psf.STDPSFGrid`
-            The grid of ePSFs.
+            The grid of ePSFs, or a dict of them: one for each detector.
+            Where two chips meet an STDPSF grid has two nodes at one place;
+            the one of the upper or right chip is put one pixel further.
         n_components : int, optional
             The number K of Gaussians.
         radius : float, optional
             Only ePSF pixels within this distance of the star are fitted
             [native pix]. By default the largest circle that keeps two
-            oversampled pixels away from the edge of the stamp, where some
-            libraries carry rows of fill values.
+            oversampled pixels away from the edge of the stamp. Rows and
+            columns of fill values at the edge are never fitted.
         executor : `~concurrent.futures.Executor`, optional
             Where the nodes are fitted; by default in a pool of threads.
+        progress_bar : bool, optional
+            Whether to show a progress bar.
         **kwargs
-            Further keywords of `fit_mixture`.
+            Further keywords of `fit_mixture`, except that ``start`` is
+            ``'centre'`` (the default: from the fit of the middle node) or
+            ``'own'`` (every node looks for its own); and ``interpolation``
+            and ``outside`` of `GriddedMixturePSF`.
 
         Returns
         -------
-        GriddedMixturePSF
+        GriddedMixturePSF or dict of them
             In the flux convention of ``psf``. It contains the pixel, as
-            ePSFs do.
+            ePSFs do. Nodes whose ePSF is blank, or cannot be fitted, are
+            bridged from their neighbours; `report` tells which.
 
         Raises
         ------
         ValueError
-            If a node cannot be fitted.
+            If no node can be fitted.
+
+        Examples
+        --------
+        >>> from photutils_mgauss import GaussianMixture, GriddedMixturePSF
+        >>> mixture = GaussianMixture([1], [[0, 0]], [[[2, 0], [0, 1]]])
+        >>> epsf = GriddedMixturePSF([mixture], [(0, 0)]).to_gridded_psf()
+        >>> psf = GriddedMixturePSF.from_gridded_psf(epsf, n_components=1)
+        >>> psf.mixtures[0].covariances
+        array([[[2., 0.],
+                [0., 1.]]])
         """
-        from photutils_mgauss.fitting import fit_mixture
-        oversampling = np.atleast_1d(psf.oversampling) * np.ones(2, int)
-        data = np.asarray(psf.data, dtype=float)
-        if radius is None:
-            edge = (np.array(data.shape[1:]) - 1) / 2 - 2
-            radius = (edge / oversampling).min()
-        fits = fit_mixture(data, n_components, radius=radius,
-                           oversampling=tuple(oversampling.tolist()),
-                           executor=executor, **kwargs)
-        failed = [i for i, fit in enumerate(fits) if fit.mixture is None]
-        if failed:
-            msg = (f'psf must have an ePSF that can be fitted at every node; '
-                   f'node {failed[0]} failed: {fits[failed[0]].message}')
+        options = {'radius': radius, 'executor': executor,
+                   'progress_bar': progress_bar, **kwargs}
+        if isinstance(psf, Mapping):
+            return {name: cls.from_gridded_psf(one, n_components, **options)
+                    for name, one in psf.items()}
+        oversampling = np.broadcast_to(psf.oversampling, 2).tolist()
+        nodes = NodeImages(np.asarray(psf.data, dtype=float),
+                           split_seams(np.array(psf.grid_xypos, float)),
+                           tuple(oversampling))
+        return cls._fitted(nodes, n_components, **options)
+
+    @classmethod
+    def from_psfex(cls, path, n_components=3, *, grid_shape=(30, 30),
+                   limits=None, contexts=None, **kwargs):
+        """
+        Fit mixtures to a PSFEx model, evaluated on a grid.
+
+        Parameters
+        ----------
+        path : str, path-like, `PSFExModel` or a dict of these
+            The ``.psf`` file, or one for each detector.
+        n_components : int, optional
+            The number K of Gaussians.
+        grid_shape : int or (ny, nx) tuple of int, optional
+            The number of nodes along y and x. There is one along an axis
+            that the model does not depend on.
+        limits : ((x_min, x_max), (y_min, y_max)), optional
+            Where the outermost nodes are [pix]. By default those of the
+            stars PSFEx used.
+        contexts : dict, optional
+            The values of all contexts that are not positions.
+        **kwargs
+            As for `from_gridded_psf`.
+
+        Returns
+        -------
+        GriddedMixturePSF or dict of them
+            A star of flux 1 has the flux 1 on the detector; PSFEx does not
+            normalise its images. It contains the pixel, as they do.
+
+        Raises
+        ------
+        ValueError
+            If the file is not a PSFEx model, see `read_psfex`.
+        """
+        options = {'grid_shape': grid_shape, 'limits': limits,
+                   'contexts': contexts, **kwargs}
+        if isinstance(path, Mapping):
+            return {name: cls.from_psfex(one, n_components, **options)
+                    for name, one in path.items()}
+        model = path if hasattr(path, 'image_at') else read_psfex(path)
+        x, y = _psfex_lattice(model, as_shape(grid_shape, 'grid_shape'),
+                              limits)
+        images = [model.image_at(x_0, y_0, **(contexts or {}))
+                  for x_0, y_0 in zip(x, y, strict=True)]
+        nodes = NodeImages(np.array(images), np.column_stack([x, y]),
+                           origin=model.origin, unit=model.sampling)
+        return cls._fitted(nodes, n_components, scaled=False, **kwargs)
+
+    @classmethod
+    def from_image_psf(cls, psf, n_components=3, *, grid_xypos=None,
+                       **kwargs):
+        """
+        Fit mixtures to one or several ePSF images.
+
+        Parameters
+        ----------
+        psf : `~photutils.psf.ImagePSF`, result of \
+`~photutils.psf.EPSFBuilder`, or sequence of these
+            One for the whole detector, or one for each of ``grid_xypos``,
+            of equal shapes, origins and oversampling.
+        n_components : int, optional
+            The number K of Gaussians.
+        grid_xypos : (N, 2) array_like, optional
+            The positions (x, y) of several ePSFs [pix]. Nodes that are
+            missing from a rectangular grid are bridged.
+        **kwargs
+            As for `from_gridded_psf`.
+
+        Returns
+        -------
+        GriddedMixturePSF
+            In the flux convention of ``psf``, with its origin.
+
+        Raises
+        ------
+        TypeError
+            If ``psf`` is not made of `~photutils.psf.ImagePSF` models.
+        ValueError
+            If the ePSFs differ in shape, origin or oversampling, or there is
+            not one for each position.
+        """
+        psfs = _image_psfs(psf)
+        if grid_xypos is None:
+            grid_xypos = np.zeros((1, 2))
+        grid_xypos = as_floats(grid_xypos, 'grid_xypos',
+                               shape=(len(psfs), 2))
+        positions, place = _full_lattice(grid_xypos)
+        images = np.zeros((len(positions), *psfs[0].data.shape))
+        images[place] = [one.data for one in psfs]
+        nodes = NodeImages(images, positions,
+                           tuple(psfs[0].oversampling.tolist()),
+                           tuple(psfs[0].origin.tolist()))
+        return cls._fitted(nodes, n_components, **kwargs)
+
+    @classmethod
+    def from_field(cls, field, *, grid_shape=(30, 30)):
+        """
+        Sample a mixture field on a grid.
+
+        Parameters
+        ----------
+        field : MixtureField or a dict of them
+            The PSF as a function of position, or one for each detector.
+        grid_shape : int or (ny, nx) tuple of int, optional
+            The number of nodes along y and x.
+
+        Returns
+        -------
+        GriddedMixturePSF or dict of them
+        """
+        if isinstance(field, Mapping):
+            return {name: cls.from_field(one, grid_shape=grid_shape)
+                    for name, one in field.items()}
+        return field.to_grid(grid_shape)
+
+    @classmethod
+    def _fitted(cls, nodes, n_components, *, scaled=True,
+                interpolation='blend', outside='clamp', **kwargs):
+        """Fit images and return the grid with the report of the fits."""
+        mixtures, scales, report = fit_nodes(nodes, n_components, **kwargs)
+        if not any(mixtures):
+            msg = ('psf must have at least one image that can be fitted, but '
+                   f'all failed, the first: {report["message"][0]}')
             raise ValueError(msg)
-        return cls([fit.mixture for fit in fits], psf.grid_xypos,
-                   scales=[fit.flux for fit in fits])
+        grid, order = make_grid(mixtures, nodes.positions,
+                                scales if scaled else None)
+        report = report[order]
+        report['id'] = np.arange(1, len(report) + 1)
+        report['bridged'] = [mixtures[i] is None for i in order]
+        report['scale'] = grid.scales
+        report['n_components'] = (grid.weights != 0).sum(axis=1)
+        return cls._from_grid(grid, report, interpolation=interpolation,
+                              outside=outside)
+
+    @property
+    def report(self):
+        """
+        How good the mixture of each node is, a `~astropy.table.QTable`.
+
+        Columns: ``id``, ``x``, ``y`` [pix], ``n_components``, ``scale``;
+        ``chi2`` of the fit; ``size_error`` and ``ellipticity_error``, the
+        dR^2/R^2 and d-epsilon of Eq. 8 by adaptive moments, and ``e1``,
+        ``e2`` of the image; ``phase_error``, half the range of the shift
+        with pixel phase that the residual causes [pix]; ``enclosed_flux``;
+        ``bridged``, whether the node was filled from its neighbours;
+        ``status`` and ``message`` of the fit, -1 for mixtures not fitted.
+        """
+        return self._report.copy()
 
     @property
     def grid_xypos(self):
         """The positions (x, y) of the nodes by y, then x, (M, 2) [pix]."""
-        x, y = np.meshgrid(self._grid.x_grid, self._grid.y_grid)
-        return np.column_stack([x.ravel(), y.ravel()])
+        return self._grid.positions
 
     @property
     def grid_shape(self):
         """The number of nodes along y and x."""
-        return self._grid.y_grid.size, self._grid.x_grid.size
+        return self._grid.shape
 
     @property
     def mixtures(self):
@@ -235,8 +398,19 @@ n_components=1)>
         return self._pixel_integrated
 
     @property
+    def interpolation(self):
+        """How neighbouring nodes are put together."""
+        return self._interpolation
+
+    @property
+    def outside(self):
+        """What happens to stars outside the outermost nodes."""
+        return self._outside
+
+    @property
     def _state(self):
-        return self._grid.serial, self._pixel_integrated
+        return (self._grid.serial, self._pixel_integrated,
+                self._interpolation, self._outside)
 
     def __repr__(self):
         pixel = ', pixel_integrated=True' if self._pixel_integrated else ''
@@ -268,10 +442,31 @@ n_components=1)>
                                        np.asarray(y_0, float))
         (x, y, flux, x_0, y_0), shape = flat_points(x, y, flux, x_0, y_0)
         out = np.empty(x.size)
-        grid = self._grid
-        _kernels.evaluate_grid(x, y, flux, x_0, y_0, grid.rows, grid.x_grid,
-                               grid.y_grid, self._pixel_integrated, out)
+        self._run(0, x, y, flux, x_0, y_0, out=out)
+        self._mark_outside(x_0, y_0, out)
         return with_unit(out.reshape(shape), unit)
+
+    def _run(self, which, *arguments, out):
+        """Call the kernel of the interpolation, 0 to 2 of its three."""
+        grid = self._grid
+        nodes = grid.rows if self._interpolation == 'blend' else grid.sums
+        _KERNELS[self._interpolation][which](
+            *arguments, nodes, grid.x_grid, grid.y_grid,
+            self._pixel_integrated, out)
+
+    def _mark_outside(self, x_0, y_0, out):
+        """Treat results of stars outside the grid as ``outside`` says."""
+        if self._outside == 'clamp':
+            return
+        outside = self._grid.is_outside(x_0, y_0)
+        if not np.any(outside):
+            return
+        if self._outside == 'raise':
+            place = [float(np.atleast_1d(a)[np.atleast_1d(outside)][0])
+                     for a in (x_0, y_0)]
+            msg = f'x_0, y_0 must be inside the grid of nodes, got {place}'
+            raise ValueError(msg)
+        out[..., outside if np.size(outside) > 1 else slice(None)] = np.nan
 
     def fit_deriv(self, x, y, flux, x_0, y_0):
         """
@@ -293,11 +488,10 @@ n_components=1)>
         """
         flux = float(np.squeeze(split_flux(flux)[0]))
         (x, y), shape = flat_points(x, y)
+        x_0, y_0 = float(np.squeeze(x_0)), float(np.squeeze(y_0))
         out = np.empty((3, x.size))
-        grid = self._grid
-        _kernels.differentiate_grid(
-            x, y, float(np.squeeze(x_0)), float(np.squeeze(y_0)), grid.rows,
-            grid.x_grid, grid.y_grid, self._pixel_integrated, out)
+        self._run(1, x, y, x_0, y_0, out=out)
+        self._mark_outside(x_0, y_0, out)
         out[1:] *= flux
         return list(out.reshape(3, *shape))
 
@@ -313,15 +507,31 @@ n_components=1)>
         Returns
         -------
         GaussianMixture
-            Of unit flux and up to 4 K Gaussians.
+            Of unit flux and up to 4 K Gaussians, or K for matched ones.
+
+        Raises
+        ------
+        ValueError
+            If the position is outside the grid and ``outside`` is not
+            ``'clamp'``.
         """
-        grid = self._grid
+        grid = self._inside(x, y)
+        if self._interpolation == 'components':
+            return grid.matched_mixture(x, y)
         index, share = grid.neighbours(x, y)
         weights = share[:, None] * (grid.scales[:, None] * grid.weights)[index]
         used = weights != 0
         return GaussianMixture(weights[used] / weights.sum(),
                                grid.means[index][used],
                                grid.covariances[index][used])
+
+    def _inside(self, x, y):
+        """Return the grid if a PSF is to be had at this position."""
+        if self._outside != 'clamp' and self._grid.is_outside(x, y):
+            msg = (f'x, y must be inside the grid of nodes, got '
+                   f'{[float(x), float(y)]}')
+            raise ValueError(msg)
+        return self._grid
 
     def scale_at(self, x, y):
         """
@@ -336,7 +546,7 @@ n_components=1)>
         -------
         float
         """
-        index, share = self._grid.neighbours(x, y)
+        index, share = self._inside(x, y).neighbours(x, y)
         return float(share @ self._grid.scales[index])
 
     def local_model(self, x, y):
@@ -370,15 +580,14 @@ n_components=1)>
         -------
         GriddedMixturePSF
         """
-        return type(self)._from_grid_like(
-            self, [mixture.convolve(kernel) for mixture in self.mixtures])
-
-    @classmethod
-    def _from_grid_like(cls, other, mixtures):
-        return GriddedMixturePSF(
-            mixtures, other.grid_xypos, flux=other.flux.value,
-            x_0=other.x_0.value, y_0=other.y_0.value, scales=other.scales,
-            pixel_integrated=other.pixel_integrated)
+        mixtures = [mixture.convolve(kernel) for mixture in self.mixtures]
+        new = GriddedMixturePSF(
+            mixtures, self.grid_xypos, flux=self.flux.value,
+            x_0=self.x_0.value, y_0=self.y_0.value, scales=self.scales,
+            pixel_integrated=self._pixel_integrated,
+            interpolation=self._interpolation, outside=self._outside)
+        new._report['bridged'] = self._report['bridged']
+        return new
 
     def render(self, x, y, flux, shape):
         """
@@ -415,10 +624,9 @@ n_components=1)>
         x, y, flux = (np.atleast_1d(np.ascontiguousarray(a)) for a in stars)
         ny, nx = as_shape(shape, 'shape')
         out = np.zeros((x.size, ny, nx))
-        grid = self._grid
-        _kernels.render_grid(
-            x, y, flux, np.rint(x) - (nx - 1) // 2, np.rint(y) - (ny - 1) // 2,
-            grid.rows, grid.x_grid, grid.y_grid, self._pixel_integrated, out)
+        self._run(2, x, y, flux, np.rint(x) - (nx - 1) // 2,
+                  np.rint(y) - (ny - 1) // 2, out=out)
+        self._mark_outside(x, y, np.moveaxis(out, 0, -1))
         return out
 
     def to_gridded_psf(self, oversampling=4, *, radius=None):
@@ -458,6 +666,81 @@ n_components=1)>
                                flux=self.flux.value, x_0=self.x_0.value,
                                y_0=self.y_0.value)
 
+    def to_galsim(self, x, y):
+        """
+        Return the PSF at a detector position as a GalSim object.
+
+        Parameters
+        ----------
+        x, y : float
+            The position [pix].
+
+        Returns
+        -------
+        `galsim.GSObject`
+            In pixels, its flux that of a star of flux 1. If the mixtures
+            contain the pixel it does, too: draw it with
+            ``method='no_pixel'`` and ``scale=1``.
+
+        Raises
+        ------
+        ImportError
+            If galsim is not installed.
+        """
+        import galsim
+        mixture = self.mixture_at(x, y)
+        scale = self.scale_at(x, y)
+        return galsim.Add([_galsim_gaussian(*gaussian, scale, galsim)
+                           for gaussian in zip(
+                               mixture.weights, mixture.means,
+                               mixture.covariances, strict=True)])
+
+    def plot_grid(self, **kwargs):
+        """
+        Draw the PSFs of all nodes, as photutils' grids do.
+
+        Parameters
+        ----------
+        **kwargs
+            Keywords of ``photutils.psf.GriddedPSFModel.plot_grid``.
+
+        Returns
+        -------
+        `matplotlib.figure.Figure`
+        """
+        return self.to_gridded_psf(2).plot_grid(**kwargs)
+
+    def _to_tables(self):
+        grid = self._grid
+        x, y = grid.positions.T
+        model = {'name': [str(self.name or '')],
+                 'pixel_integrated': [self._pixel_integrated],
+                 'interpolation': [self._interpolation],
+                 'outside': [self._outside]}
+        nodes = {'x': x, 'y': y, 'scale': grid.scales, 'weight': grid.weights,
+                 'mean': grid.means, 'covariance': grid.covariances}
+        report = {name: np.asarray(self._report[name])
+                  for name in self._report.colnames}
+        return {'model': model, 'parameters': self._parameter_table(),
+                'nodes': nodes, 'report': report}
+
+    @classmethod
+    def _from_tables(cls, tables):
+        model, nodes = tables['model'], tables['nodes']
+        n = len(nodes['x'])
+        grid = checked_arrays(
+            nodes['x'], nodes['y'], nodes['weight'].reshape(n, -1),
+            nodes['mean'].reshape(n, -1, 2),
+            nodes['covariance'].reshape(n, -1, 2, 2), nodes['scale'])
+        report = tables.get('report')
+        return cls._from_grid(
+            grid, QTable(report) if report else None,
+            pixel_integrated=model['pixel_integrated'][0],
+            interpolation=str(model['interpolation'][0]),
+            outside=str(model['outside'][0]),
+            name=str(model['name'][0]) or None,
+            **cls._parameter_keywords(tables['parameters']))
+
     def _half_size(self):
         grid = self._grid
         stddevs = np.sqrt(grid.covariances[..., [0, 1], [0, 1]])
@@ -465,53 +748,54 @@ n_components=1)>
         return reach.max(axis=(0, 1)) + 0.5 * self._pixel_integrated
 
 
-def _make_grid(mixtures, grid_xypos, scales):
-    for mixture in mixtures:
-        if not isinstance(mixture, GaussianMixture):
-            msg = (f'mixtures must be GaussianMixture objects, got '
-                   f'{mixture!r:.80}')
+def _psfex_lattice(model, grid_shape, limits):
+    """Return the positions x, y (M,) of the nodes for a PSFEx model."""
+    axes = []
+    limits = model.position_range if limits is None else limits
+    for n, limit, dependence in zip(grid_shape[::-1], limits,
+                                    model.position_range, strict=True):
+        if dependence is None:
+            axes.append(np.array([0.0 if limit is None else limit[0]]))
+        else:
+            axes.append(np.linspace(*limit, n) if n > 1
+                        else np.array([np.mean(limit)]))
+    x, y = np.meshgrid(*axes)
+    return x.ravel(), y.ravel()
+
+
+def _image_psfs(psf):
+    """Return a list of ImagePSF models that are alike."""
+    several = isinstance(psf, (list, tuple)) and not hasattr(psf, 'epsf')
+    psfs = [getattr(one, 'epsf', one) for one in (psf if several else [psf])]
+    for one in psfs:
+        if not isinstance(one, ImagePSF):
+            msg = f'psf must be made of ImagePSF models, got {one!r:.80}'
             raise TypeError(msg)
-    n = len(mixtures)
-    if n == 0:
-        msg = 'mixtures must have at least one element, got none'
-        raise ValueError(msg)
-    positions = as_floats(grid_xypos, 'grid_xypos', shape=(n, 2))
-    order, x_grid, y_grid = _lattice(positions)
-    scales = (np.ones(n) if scales is None
-              else as_floats(scales, 'scales', shape=(n,)))
-    if not (scales > 0).all():
-        msg = f'scales must be positive, got {scales.min()}'
-        raise ValueError(msg)
-    weights, means, covariances = _stack([mixtures[i] for i in order])
-    return _Grid(x_grid, y_grid, weights, means, covariances, scales[order])
+        pairs = [(getattr(one, name), getattr(psfs[0], name))
+                 for name in ('origin', 'oversampling')]
+        pairs.append((one.data.shape, psfs[0].data.shape))
+        if not all(np.array_equal(*pair) for pair in pairs):
+            msg = ('psf must have ePSFs of one shape, origin and '
+                   'oversampling, got different ones')
+            raise ValueError(msg)
+    return psfs
 
 
-def _lattice(positions):
-    """Return the order of positions by y, then x, and the two axes."""
-    x_grid, y_grid = np.unique(positions[:, 0]), np.unique(positions[:, 1])
-    order = np.lexsort((positions[:, 0], positions[:, 1]))
-    doubled = (np.diff(positions[order], axis=0) == 0).all(axis=1)
-    if doubled.any():
-        where = positions[order][doubled.argmax()].tolist()
-        msg = f'grid_xypos must not have two nodes at one place, got {where}'
+def _full_lattice(grid_xypos):
+    """Return all nodes of the rectangular grid, and which ones are given."""
+    x, i = np.unique(grid_xypos[:, 0], return_inverse=True)
+    y, j = np.unique(grid_xypos[:, 1], return_inverse=True)
+    place = j * x.size + i
+    if np.unique(place).size != place.size:
+        msg = 'grid_xypos must not have two nodes at one place'
         raise ValueError(msg)
-    if x_grid.size * y_grid.size != len(positions):
-        msg = (f'grid_xypos must form a rectangular grid, got '
-               f'{len(positions)} positions with {x_grid.size} different x '
-               f'and {y_grid.size} different y')
-        raise ValueError(msg)
-    return order, x_grid, y_grid
+    nodes = np.stack(np.meshgrid(x, y), axis=-1)
+    return nodes.reshape(-1, 2), place
 
 
-def _stack(mixtures):
-    """Return stacked arrays, padded with round Gaussians of weight zero."""
-    k = max(mixture.n_components for mixture in mixtures)
-    weights = np.zeros((len(mixtures), k))
-    means = np.zeros((len(mixtures), k, 2))
-    covariances = np.tile(np.eye(2), (len(mixtures), k, 1, 1))
-    for m, mixture in enumerate(mixtures):
-        used = slice(mixture.n_components)
-        weights[m, used] = mixture.weights
-        means[m, used] = mixture.means
-        covariances[m, used] = mixture.covariances
-    return weights, means, covariances
+def _galsim_gaussian(weight, mean, covariance, scale, galsim):
+    """Return one Gaussian: a round one of the same area, sheared."""
+    root = np.linalg.cholesky(covariance)
+    size = np.linalg.det(covariance) ** 0.25
+    round_one = galsim.Gaussian(sigma=size, flux=scale * weight)
+    return round_one.transform(*(root / size).ravel()).shift(*mean)

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import erf
 
 from photutils_mgauss import _kernels
+from photutils_mgauss._files import storable
 from photutils_mgauss._validation import as_floats, as_real, as_shape
 
 __all__ = ['GaussianMixture', 'Moments', 'blend']
@@ -25,6 +26,7 @@ class Moments(NamedTuple):
     covariance: np.ndarray
 
 
+@storable
 @dataclass(frozen=True, eq=False, repr=False)
 class GaussianMixture:
     r"""
@@ -96,6 +98,20 @@ class GaussianMixture:
     def __repr__(self):
         return (f'<GaussianMixture of {self.n_components}, weights '
                 f'{np.array2string(self.weights, precision=3)}>')
+
+    _columns = {'components': {'weight': '', 'mean': 'pix',
+                               'covariance': 'pix2'}}
+
+    def _to_tables(self):
+        return {'components': {'weight': self.weights, 'mean': self.means,
+                               'covariance': self.covariances}}
+
+    @classmethod
+    def _from_tables(cls, tables):
+        columns = tables['components']
+        n = len(columns['weight'])
+        return cls(columns['weight'], columns['mean'].reshape(n, 2),
+                   columns['covariance'].reshape(n, 2, 2))
 
     @classmethod
     def from_stddevs(cls, weights, means, stddevs, rho):

@@ -11,6 +11,7 @@ The weights of K Gaussians are held as K - 1 stick-breaking fractions
 import numpy as np
 
 from photutils_mgauss import _kernels
+from photutils_mgauss._files import storable
 from photutils_mgauss._psf_model import (
     PSFModel,
     PSFParameter,
@@ -34,6 +35,7 @@ _RHO_BOUNDS = (-0.9999, 0.9999)
 _FRACTION_BOUNDS = (0, 1)
 
 
+@storable
 class MultiGaussianPSFModel(PSFModel):
     r"""
     A PSF that is a sum of K correlated Gaussians.
@@ -274,6 +276,23 @@ class MultiGaussianPSFModel(PSFModel):
             columns += shape.derivatives(k, flux, jets[k]) if any(
                 free[first:first + 5]) else [value] * 5
         return columns
+
+    _columns = {'model': {'name': '', 'pixel_integrated': ''},
+                'parameters': PSFModel._parameter_columns}
+
+    def _to_tables(self):
+        return {'model': {'name': [str(self.name or '')],
+                          'pixel_integrated': [self._pixel_integrated]},
+                'parameters': self._parameter_table()}
+
+    @classmethod
+    def _from_tables(cls, tables):
+        model, parameters = tables['model'], tables['parameters']
+        keywords = cls._parameter_keywords(parameters)
+        # flux, x_0, y_0, K - 1 fractions and 5 K more.
+        return cls(n_components=(len(parameters['name']) - 2) // 6,
+                   pixel_integrated=model['pixel_integrated'][0],
+                   name=str(model['name'][0]) or None, **keywords)
 
     def _half_size(self):
         shape = _Shape(self._shape_parameters)

@@ -224,5 +224,5 @@ def test_bad_mixtures_and_scales_are_named():
         GriddedMixturePSF([mixture, 3], [(0, 0), (1, 0)])
     with pytest.raises(ValueError, match='at least one element'):
         GriddedMixturePSF([], np.empty((0, 2)))
-    with pytest.raises(ValueError, match='scales must be positive, got -1'):
+    with pytest.raises(ValueError, match='scales must be positive and finite, got -1'):
         GriddedMixturePSF([mixture], [(0, 0)], scales=[-1])

@@ -20,6 +20,7 @@ SKY_PACKAGES = ('gwcs', 'astropy.coordinates', 'astropy.time', 'astropy.wcs')
 with TABLE.open(newline='') as file:
     ROWS = {row['Module']: row for row in csv.DictReader(file)}
 LAYERS = {name: int(row['Layer']) for name, row in ROWS.items()}
+KNOWN = [name for name in MODULES if name in LAYERS]
 
 
 def parse(name):
@@ -43,7 +44,7 @@ def own_modules(node):
     parts = [name.split('.') for name in imported_names(node)]
     return {words[1] for words in parts
             if words[0] == 'photutils_mgauss' and len(words) > 1
-            and words[1] in MODULES}
+            and words[1] in LAYERS}
 
 
 def allowed_plotting(tree):
@@ -84,17 +85,17 @@ def test_every_module_has_a_layer():
     assert not unknown, f'add {unknown} to the table in docs/layers.csv'
 
 
-@pytest.mark.parametrize('name', MODULES)
+@pytest.mark.parametrize('name', KNOWN)
 def test_imports_go_downward(name):
     assert upward_imports(name, parse(name)) == []
 
 
 def test_no_two_modules_import_each_other():
-    graph = {name: top_level_imports(parse(name)) for name in MODULES}
+    graph = {name: top_level_imports(parse(name)) for name in KNOWN}
     TopologicalSorter(graph).prepare()
 
 
-@pytest.mark.parametrize('name', MODULES)
+@pytest.mark.parametrize('name', KNOWN)
 def test_the_halves_meet_only_in_the_table_between_them(name):
     half = ROWS[name]['Half']
     strangers = {'image': 'sky', 'sky': 'image'}.get(half)
@@ -104,7 +105,7 @@ def test_the_halves_meet_only_in_the_table_between_them(name):
 
 
 @pytest.mark.parametrize(
-    'name', [name for name in MODULES if ROWS[name]['Half'] == 'image'])
+    'name', [name for name in KNOWN if ROWS[name]['Half'] == 'image'])
 def test_the_image_half_knows_nothing_of_sky_and_time(name):
     names = [word for node in ast.walk(parse(name))
              for word in imported_names(node)]
@@ -123,9 +124,7 @@ def test_the_image_half_knows_nothing_of_sky_and_time(name):
     ('def draw(self):\n    from photutils_mgauss import plotting', 1),
     ('from photutils_mgauss import plotting', 1),
 ])
-def test_an_upward_import_is_seen(source, count, monkeypatch):
-    monkeypatch.setattr('test_layers.MODULES',
-                        ['mixture', 'plotting', 'cli', '_validation'])
+def test_an_upward_import_is_seen(source, count):
     assert len(upward_imports('mixture', ast.parse(source))) == count
 
 

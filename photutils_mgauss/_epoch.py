@@ -1,0 +1,374 @@
+"""
+One exposure: its table of stars, WCS, time and observer, and how it is read.
+
+Tables are used under photutils' column names. What leaves this module is a
+`Detections`: plain float64 arrays in the units of the frame.
+"""
+from dataclasses import dataclass, field, replace
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import CartesianRepresentation
+from astropy.table import Table
+
+from photutils_mgauss._parallax import (
+    _known_observer,
+    julian_years,
+    observer_velocity,
+    remove_aberration,
+)
+from photutils_mgauss._stacked import sandwich_2x2
+from photutils_mgauss._tangent_plane import unit_vectors
+from photutils_mgauss._wcs_tools import (
+    check_celestial,
+    pixel_jacobian,
+    pixel_to_vectors,
+)
+
+# What is read, in order of preference, and the unit of a plain number.
+COLUMNS = {
+    'x': ('x_fit', 'x'), 'y': ('y_fit', 'y'),
+    'x_err': ('x_err', 'x_error'), 'y_err': ('y_err', 'y_error'),
+    'ra': ('ra',), 'dec': ('dec',),
+    'ra_err': ('ra_error', 'ra_err'), 'dec_err': ('dec_error', 'dec_err'),
+    'xy_cov': ('xy_cov',), 'flux': ('flux_fit', 'flux'), 'id': ('id',),
+    'time': ('time',),
+}
+
+
+def find_column(table, key):
+    """Return the name of the column that holds ``key``, or None."""
+    for name in COLUMNS[key]:
+        if name in table.colnames:
+            return name
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class Epoch:
+    """
+    One exposure: a table of stars, and where and when they were seen.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        One row per star, with positions and their standard errors as
+
+        * pixels, 0 at the centre of the first one: ``x_fit``, ``y_fit``,
+          ``x_err``, ``y_err`` as photutils names them (or ``x``, ``y``),
+          optionally the covariance ``xy_cov`` [pix^2]; or
+        * ICRS positions: ``ra``, ``dec`` [deg], ``ra_error``, ``dec_error``
+          [mas], the first with the cosine of the declination in it, as in
+          the Gaia catalogue (``ra_err`` and ``dec_err`` will do).
+
+        Optional columns: ``id`` (any type, unique), ``flux_fit``, and
+        ``time``, the time of each row. Columns may have other units.
+        Masked and non-finite positions are left out and flagged; errors
+        that are not positive get no weight and a flag.
+    wcs : APE 14 WCS, optional
+        A gwcs or `astropy.wcs.WCS` with celestial axes, of which only the
+        forward transform is used. Without one, pixels are coordinates in a
+        plane, x in place of right ascension; a column unit of angle or
+        ``pixel_scale`` gives them a scale.
+    time : `~astropy.time.Time` or float, optional
+        Middle of the exposure; numbers are Julian years (TDB). Required
+        unless the table has a column ``time``.
+    observer : str or `~astropy.coordinates.CartesianRepresentation`, optional
+        Where the parallax is seen from: 'earth' (the default), 'leo', 'l2',
+        or a barycentric place. Only if that place has a velocity attached
+        are positions corrected for aberration; see `barycentric_observer`.
+    pixel_scale : `~astropy.units.Quantity`, optional
+        Angle of one pixel, for epochs without WCS.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the table lacks a column, or the WCS is not celestial, or there
+        is no time.
+
+    Examples
+    --------
+    >>> from astropy.table import Table
+    >>> from photutils_mgauss import Epoch
+    >>> table = Table({'x_fit': [10.0], 'y_fit': [20.0],
+    ...                'x_err': [0.01], 'y_err': [0.01]})
+    >>> Epoch(table, time=2026.5)
+    <Epoch: 1 star at 2026.500, no WCS>
+    """
+
+    table: Table
+    wcs: object = None
+    time: object = None
+    observer: object = field(default=None, kw_only=True)
+    pixel_scale: u.Quantity = field(default=None, kw_only=True)
+
+    def __post_init__(self):
+        if not isinstance(self.table, Table):
+            msg = (f'table must be an astropy Table, got '
+                   f'{type(self.table).__name__}')
+            raise TypeError(msg)
+        if self.wcs is not None:
+            check_celestial(self.wcs)
+        _check_observer(self.observer)
+        _check_columns(self.table, self.is_pixels)
+        _check_scale(self)
+        _check_time(self)
+
+    def __repr__(self):
+        n = len(self.table)
+        stars = f'{n} star' if n == 1 else f'{n} stars'
+        package = type(self.wcs).__module__.split('.')[0]
+        wcs = 'no WCS' if self.wcs is None else f'{package} WCS'
+        return f'<Epoch: {stars} at {self.mean_year:.3f}, {wcs}>'
+
+    @property
+    def is_pixels(self):
+        """Whether positions are x, y, which win over ra, dec."""
+        has_xy = find_column(self.table, 'x') is not None
+        has_sky = find_column(self.table, 'ra') is not None
+        return has_xy and (self.wcs is not None or not has_sky)
+
+    @property
+    def is_sky(self):
+        """Whether the epoch has places in the sky, by WCS or ra, dec."""
+        return self.wcs is not None or not self.is_pixels
+
+    @property
+    def years(self):
+        """Julian years (TDB), a scalar or one per row."""
+        name = find_column(self.table, 'time')
+        if self.time is None:
+            column = self.table[name]
+            return julian_years(column, 'the column time')
+        return julian_years(self.time)
+
+    @property
+    def mean_year(self):
+        """Mean Julian year (TDB) of the exposure."""
+        return float(np.nanmean(self.years))
+
+    def with_wcs(self, wcs):
+        """Return this epoch with another WCS."""
+        return replace(self, wcs=wcs)
+
+
+def _check_observer(observer):
+    if observer is None or isinstance(observer, CartesianRepresentation):
+        return
+    _known_observer(observer)
+
+
+def _check_columns(table, is_pixels):
+    wanted = (('x', 'y', 'x_err', 'y_err') if is_pixels
+              else ('ra', 'dec', 'ra_err', 'dec_err'))
+    for key in wanted:
+        if find_column(table, key) is None:
+            words = ' or '.join(repr(name) for name in COLUMNS[key])
+            msg = f'table must have a column {words}, got {table.colnames}'
+            raise ValueError(msg)
+
+
+def _check_scale(epoch):
+    scale = epoch.pixel_scale
+    if scale is None:
+        return
+    if epoch.is_sky:
+        msg = 'pixel_scale must be None for an epoch with sky positions'
+        raise ValueError(msg)
+    if not isinstance(scale, u.Quantity):
+        msg = f'pixel_scale must be a Quantity, got {scale!r}'
+        raise TypeError(msg)
+    _angle_per_pixel(scale)
+
+
+def _angle_per_pixel(scale):
+    unit = u.mas / u.pix if u.pix in scale.unit.bases else u.mas
+    value = scale.to_value(unit)
+    if not (np.ndim(value) == 0 and np.isfinite(value) and value > 0):
+        msg = f'pixel_scale must be a positive angle, got {scale}'
+        raise ValueError(msg)
+    return float(value)
+
+
+def _check_time(epoch):
+    if epoch.time is None and find_column(epoch.table, 'time') is None:
+        msg = "time must be given, or the table must have a column 'time'"
+        raise ValueError(msg)
+    years = epoch.years
+    if years.shape not in ((), (len(epoch.table),)):
+        msg = (f'time must be a scalar or one per row, got shape '
+               f'{years.shape}')
+        raise ValueError(msg)
+    if years.ndim == 0 and not np.isfinite(years):
+        msg = f'time must be finite, got {epoch.time}'
+        raise ValueError(msg)
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """
+    What an epoch says about each of its n rows, as plain arrays.
+
+    ``vectors`` (3, n) are ICRS directions, or None for a plane without sky.
+    ``plane`` (2, n) and ``covariance`` (3, n: xx, xy, yy) are in the frame's
+    unit, mas or pixels. ``found`` says which positions are finite,
+    ``usable`` which errors are good as well.
+    """
+
+    ids: np.ndarray | None
+    vectors: np.ndarray | None
+    plane: np.ndarray
+    covariance: np.ndarray
+    years: np.ndarray
+    flux: np.ndarray
+    found: np.ndarray
+    usable: np.ndarray
+
+
+def numbers(table, key, unit=None):
+    """
+    Return a column as float64, NaN where masked.
+
+    A column without unit is taken to be in ``unit``.
+    """
+    name = find_column(table, key)
+    column = table[name]
+    has = getattr(column, 'unit', None)
+    if unit is not None and has is not None and has != '':
+        try:
+            column = u.Quantity(np.ma.filled(column, np.nan), has).to(unit)
+        except u.UnitConversionError as error:
+            msg = (f'column {name!r} must have a unit like {unit}, '
+                   f'got {has}')
+            raise ValueError(msg) from error
+        return np.array(column.value, dtype=float)
+    try:
+        return np.ma.filled(np.ma.asarray(column, dtype=float), np.nan)
+    except (TypeError, ValueError) as error:
+        msg = f'column {name!r} must hold numbers'
+        raise TypeError(msg) from error
+
+
+def plane_unit(epoch):
+    """Return 'mas' or 'pix', the unit an epoch without sky comes in."""
+    if epoch.is_sky or epoch.pixel_scale is not None:
+        return 'mas'
+    unit = getattr(epoch.table[find_column(epoch.table, 'x')], 'unit', None)
+    if unit is not None and u.Unit(unit).is_equivalent(u.mas):
+        return 'mas'
+    return 'pix'
+
+
+def pixel_size(epoch):
+    """Return plane units in a pixel of an epoch without sky, or None."""
+    if epoch.pixel_scale is not None:
+        return _angle_per_pixel(epoch.pixel_scale)
+    return 1.0 if plane_unit(epoch) == 'pix' else None
+
+
+def sky_vectors(epoch):
+    """Return ICRS unit vectors (3, n) of an epoch with sky positions."""
+    if epoch.is_pixels:
+        x, y = pixels(epoch)
+        vectors = pixel_to_vectors(epoch.wcs, x, y)
+    else:
+        vectors = unit_vectors(numbers(epoch.table, 'ra', u.deg),
+                               numbers(epoch.table, 'dec', u.deg))
+    velocity = observer_velocity(epoch.observer)
+    if velocity is None:
+        return vectors
+    return remove_aberration(vectors, velocity)
+
+
+def pixels(epoch):
+    """Return x and y [pix] of an epoch."""
+    return numbers(epoch.table, 'x', u.pix), numbers(epoch.table, 'y', u.pix)
+
+
+def read_epoch(epoch, plane=None, vectors=None):
+    """
+    Return the `Detections` of an epoch.
+
+    ``plane`` is the common `TangentPlane`, and ``vectors`` the directions
+    already computed; both None where nothing is known about the sky.
+    """
+    if vectors is None:
+        positions, covariance = _read_plane(epoch)
+    else:
+        positions = plane.project(vectors)
+        covariance = _sky_covariance(epoch, plane, positions)
+    found = np.isfinite(positions).all(axis=0)
+    years = np.asarray(epoch.years, dtype=float)
+    found &= np.isfinite(years)
+    positions = np.where(found, positions, np.nan)
+    usable = found & _positive_definite(covariance)
+    return Detections(_ids(epoch.table), vectors, positions, covariance,
+                      years, _flux(epoch.table), found, usable)
+
+
+def _read_plane(epoch):
+    unit, scale = u.pix, 1.0
+    if plane_unit(epoch) == 'mas':
+        unit = u.mas
+        if epoch.pixel_scale is not None:
+            unit, scale = u.pix, _angle_per_pixel(epoch.pixel_scale)
+    x, y, dx, dy = (scale * numbers(epoch.table, key, unit)
+                    for key in ('x', 'y', 'x_err', 'y_err'))
+    covariance = _covariance(epoch.table, dx, dy, scale**2, unit**2)
+    return np.stack([x, y]), covariance
+
+
+def _covariance(table, dx, dy, scale=1.0, unit=u.pix**2):
+    """Return xx, xy, yy; errors that are not positive become NaN."""
+    cross = np.zeros_like(dx)
+    if find_column(table, 'xy_cov') is not None:
+        cross = scale * numbers(table, 'xy_cov', unit)
+    good = (dx > 0) & (dy > 0) & np.isfinite(dx) & np.isfinite(dy)
+    return np.where(good, np.stack([dx * dx, cross, dy * dy]), np.nan)
+
+
+def _sky_covariance(epoch, plane, positions):
+    """Carry the errors of pixels or sky positions to the plane."""
+    if epoch.is_pixels:
+        x, y = pixels(epoch)
+        errors = (numbers(epoch.table, key, u.pix)
+                  for key in ('x_err', 'y_err'))
+        covariance = _covariance(epoch.table, *errors)
+        jacobian = pixel_jacobian(epoch.wcs, plane, x, y)
+    else:
+        errors = (numbers(epoch.table, key, u.mas)
+                  for key in ('ra_err', 'dec_err'))
+        covariance = _covariance(epoch.table, *errors, unit=u.mas**2)
+        jacobian = plane.local_jacobian(positions)
+    return sandwich_2x2(jacobian, covariance)
+
+
+def _positive_definite(covariance):
+    xx, xy, yy = covariance
+    with np.errstate(invalid='ignore'):
+        return (xx > 0) & (yy > 0) & (xx * yy - xy * xy > 1e-12 * xx * yy)
+
+
+def _ids(table):
+    name = find_column(table, 'id')
+    if name is None:
+        return None
+    if np.any(getattr(table[name], 'mask', False)):
+        msg = "the column 'id' must not have masked values"
+        raise ValueError(msg)
+    ids = np.asarray(table[name])
+    values, counts = np.unique(ids, return_counts=True)
+    if len(values) < len(ids):
+        msg = (f"the column 'id' must hold unique values, got "
+               f'{values[counts > 1][0]!r} {counts.max()} times')
+        raise ValueError(msg)
+    return ids
+
+
+def _flux(table):
+    if find_column(table, 'flux') is None:
+        return np.full(len(table), np.nan)
+    name = find_column(table, 'flux')
+    return np.ma.filled(np.ma.asarray(
+        getattr(table[name], 'value', table[name]), dtype=float), np.nan)
+

@@ -1,0 +1,283 @@
+"""
+The course of a field fit: start, weights, rejection, degree after degree.
+
+Nothing here knows of images or tables; see `photutils_mgauss.field`.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+
+from photutils_mgauss._field_fit import (
+    Equations,
+    Prior,
+    Problem,
+    model_stamps,
+    optimise,
+)
+
+# Stars used while the degree is low: enough for its few coefficients.
+_START_STARS = 60
+_STARS_PER_TERM = 40
+# A pixel is deviant beyond this many standard deviations.
+_PIXEL_LIMIT = 5.0
+# A star is deviant if its reduced chi^2 is beyond the median by this many
+# robust standard deviations and by this share of the median, or if it has
+# more than this share of deviant pixels.
+_STAR_LIMIT = 6.0
+_STAR_EXCESS = 0.3
+_MAX_DEVIANT_PIXELS = 0.1
+# Relative error of the PSF assumed before anything is known of it.
+_FIRST_ACCURACY = 0.1
+
+
+@dataclass
+class FieldFit:
+    """
+    The state of the fit.
+
+    Attributes
+    ----------
+    problem : Problem
+    coefficients : (T, K, 6) `~numpy.ndarray`
+    prior : Prior
+    equations : Equations
+        At the coefficients.
+    accuracy : float
+        The relative error of the PSF, which is part of the weights.
+    deviant_pixels : (n, s, s) `~numpy.ndarray` of bool
+    """
+
+    problem: Problem
+    coefficients: np.ndarray
+    prior: Prior
+    equations: Equations
+    accuracy: float
+    deviant_pixels: np.ndarray
+
+
+def n_terms(degree):
+    """Return the number of terms of a polynomial of x and y."""
+    return (degree + 1) * (degree + 2) // 2
+
+
+def polynomials(u, v, degree):
+    """
+    Return products of Legendre polynomials of total degree <= degree.
+
+    u, v (n,) are in [-1, 1] on the detector; the result is (n, T), terms of a
+    lower degree first.
+    """
+    legendre = np.polynomial.legendre.legvander
+    a, b = legendre(u, degree), legendre(v, degree)
+    terms = [(total - j, j) for total in range(degree + 1)
+             for j in range(total + 1)]
+    return np.stack([a[..., i] * b[..., j] for i, j in terms], axis=-1)
+
+
+def first_width(problem):
+    """Estimate the standard deviation of the PSF from the stacked stars."""
+    data, good = problem.stamps.data, problem.stamps.good
+    inner = problem.stamps.offsets() <= 2.5
+    light = np.where(good, data, 0)[:, inner].sum(axis=1)
+    bright = light > 0
+    shares = np.where(good, data, np.nan)[bright]
+    shares = shares / light[bright, None, None]
+    usable = good[bright].any(axis=0)
+    stack = np.zeros(usable.shape)
+    stack[usable] = np.nanmedian(shares[:, usable], axis=0)
+    order = np.argsort(problem.stamps.offsets(), axis=None)
+    radius = problem.stamps.offsets().ravel()[order]
+    growth = np.cumsum(stack.ravel()[order])
+    half = radius[np.argmax(growth >= 0.5 * growth.max())]
+    # Half the light of a Gaussian is inside 1.18 standard deviations.
+    return max(half, 0.7) / 1.18
+
+
+def ladder(n_components, width):
+    """Return shapes (K, 6) of concentric round Gaussians of growing size."""
+    shapes = np.zeros((n_components, 6))
+    if n_components == 1:
+        sizes, weights = np.ones(1), np.ones(1)
+    else:
+        sizes = np.geomspace(0.8, 3.5, n_components)
+        weights = np.geomspace(1, 0.05, n_components)
+    shapes[:, 0] = np.log(weights)
+    shapes[:, 3] = shapes[:, 5] = -np.log(sizes * width)
+    # Gaussians of one centre only move apart if they start apart.
+    angle = 2.4 * np.arange(n_components)
+    shapes[:, 1] = 0.2 * width * sizes * np.cos(angle)
+    shapes[:, 2] = 0.2 * width * sizes * np.sin(angle)
+    shapes[:, 1:3] -= shapes[0, 1:3]
+    return shapes
+
+
+def begin(problem, n_components, strength, workers):
+    """Fit one round Gaussian, then the mixture, the same everywhere."""
+    brightest = np.argsort(-problem.sources[:, 0, 2])[:_START_STARS]
+    few = problem.subset(brightest)
+    few.basis = np.ones((len(brightest), 1))
+    width = first_width(few)
+    one = ladder(1, width)
+    state = _new_state(few, one, width, strength)
+    weigh(state, reject=False)
+    advance(state, workers, tolerance=0.1)
+    width = np.exp(-state.coefficients[0, 0, [3, 5]].mean())
+    shapes = ladder(n_components, width)
+    mixture = _new_state(state.problem, shapes, width, strength)
+    weigh(mixture, reject=False)
+    advance(mixture, workers, max_steps=60, tolerance=0.05)
+    mixture.prior.mean[0] = shapes
+    return mixture.coefficients, shapes, width
+
+
+def _new_state(problem, shapes, width, strength):
+    terms = problem.basis.shape[1]
+    coefficients = np.zeros((terms, *shapes.shape))
+    coefficients[0] = shapes
+    prior = Prior.about(shapes, terms, width, strength)
+    return FieldFit(problem, coefficients, prior, None, _FIRST_ACCURACY,
+                    np.zeros(problem.stamps.good.shape, bool))
+
+
+def advance(state, workers, **options):
+    """Optimise the coefficients at the present weights, in place."""
+    state.coefficients, state.equations = optimise(
+        state.problem, state.coefficients, state.prior, workers, **options)
+
+
+def weigh(state, *, reject, share=1.0):
+    """
+    Renew weights and rejections from the present model, in place.
+
+    The variance is that of the model, not of the data. It includes the
+    present relative error of the PSF: while the model is still poor, bright
+    stars would otherwise drown all others, and every star would be deviant.
+    """
+    problem = state.problem
+    stamps, good = problem.stamps, problem.stamps.good
+    if state.equations is None:
+        light = np.maximum(stamps.data, 0)
+        residual = None
+    else:
+        model = model_stamps(problem, state.coefficients)
+        residual = stamps.data - model
+        light = np.maximum(model - problem.sky[:, None, None], 0)
+    variance = stamps.base + stamps.slope * light
+    if residual is not None:
+        state.accuracy = share * _accuracy(residual, light, variance,
+                                           problem)
+    variance = variance + (state.accuracy * light) ** 2
+    if reject and residual is not None:
+        _reject(state, residual, variance)
+    problem.weights = np.where(good & ~state.deviant_pixels, 1 / variance, 0)
+
+
+def _accuracy(residual, light, variance, problem):
+    """
+    Return the relative error of the PSF that chi^2 asks for.
+
+    The median over stars, less what it may be by chance: one blend does not
+    change it.
+    """
+    w = np.where(problem.weights > 0, light**2, 0)[problem.used]
+    excess = np.sum(w * (residual**2 - variance)[problem.used], axis=(1, 2))
+    squares = excess / np.maximum(np.sum(w**2, axis=(1, 2)), 1e-300)
+    middle = np.median(squares)
+    scatter = 1.4826 * np.median(np.abs(squares - middle))
+    return np.sqrt(max(middle - 2.5 * scatter / np.sqrt(len(squares)), 0))
+
+
+def _reject(state, residual, variance):
+    problem = state.problem
+    good = problem.stamps.good
+    pulls = np.where(good, residual / np.sqrt(variance), np.nan)
+    state.deviant_pixels = _deviant_pixels(pulls, problem.used)
+    kept = good & ~state.deviant_pixels
+    chi2 = np.nansum(np.where(kept, pulls**2, 0), axis=(1, 2))
+    reduced = chi2 / np.maximum(kept.sum(axis=(1, 2)), 1)
+    share = state.deviant_pixels.sum(axis=(1, 2)) / good.sum(axis=(1, 2))
+    used = _not_deviant(reduced, problem.used)
+    used &= share <= _MAX_DEVIANT_PIXELS
+    used &= problem.sources[:, 0, 2] > 0
+    middle = problem.stamps.corners + problem.stamps.radius
+    moved = np.abs(problem.sources[:, 0, :2] - middle).max(axis=1)
+    used &= moved < max(2.0, 0.3 * problem.stamps.radius)
+    problem.used = used
+
+
+def _deviant_pixels(pulls, used):
+    """
+    Return which pixels are beyond the limit and beyond their peers.
+
+    Where the pixels of most stars at one offset are off, it is the model
+    that errs.
+    """
+    columns = np.isfinite(pulls[used]).any(axis=0)
+    typical = np.ones(columns.shape)
+    typical[columns] = 1.4826 * np.nanmedian(np.abs(pulls[used][:, columns]),
+                                             axis=0)
+    limit = _PIXEL_LIMIT * np.maximum(typical, 1)
+    return np.abs(np.nan_to_num(pulls)) > limit
+
+
+def _not_deviant(reduced, used):
+    middle = np.median(reduced[used])
+    scatter = 1.4826 * np.median(np.abs(reduced[used] - middle))
+    limit = middle + max(_STAR_LIMIT * scatter, _STAR_EXCESS * middle)
+    return reduced <= limit
+
+
+def run(problem, n_components, degree, workers, *, strength=1.0, reject=True):
+    """
+    Fit the field, raising the degree from 0.
+
+    ``problem.basis`` holds the terms of ``degree``. Returns a `FieldFit`.
+    """
+    start, shapes, width = begin(problem, n_components, strength, workers)
+    prior = Prior.about(shapes, n_terms(degree), width, strength)
+    state = FieldFit(problem, start, prior, None, _FIRST_ACCURACY,
+                     np.zeros(problem.stamps.good.shape, bool))
+    brightest = np.argsort(-problem.sources[:, 0, 2])
+    for low in range(degree):
+        count = _STARS_PER_TERM * n_terms(low + 1)
+        _stage(state, np.sort(brightest[:count]), low, workers, reject)
+    return _finish(state, degree, workers, reject)
+
+
+def _stage(state, index, degree, workers, reject):
+    """Fit some of the stars at a low degree; only coefficients remain."""
+    terms = n_terms(degree)
+    few = state.problem.subset(index)
+    few.basis = np.ascontiguousarray(few.basis[:, :terms])
+    part = FieldFit(few, _raised(state.coefficients, terms),
+                    state.prior.first(terms), None, state.accuracy,
+                    np.zeros(few.stamps.good.shape, bool))
+    _settle_all(part, workers)
+    for _ in range(2):
+        weigh(part, reject=reject, share=0.5)
+        advance(part, workers, tolerance=0.1, max_steps=10)
+    state.coefficients, state.accuracy = part.coefficients, part.accuracy
+
+
+def _settle_all(state, workers):
+    """Fit every stamp's own numbers to the present field."""
+    state.equations = None
+    weigh(state, reject=False)
+    advance(state, workers, max_steps=0)
+
+
+def _finish(state, degree, workers, reject):
+    terms = n_terms(degree)
+    state.coefficients = _raised(state.coefficients, terms)
+    _settle_all(state, workers)
+    for share, tolerance in ((0.3, 0.1), (0.3, 0.1), (0.5, 0.01), (1, 1e-3)):
+        weigh(state, reject=reject, share=share)
+        advance(state, workers, tolerance=tolerance)
+    return state
+
+
+def _raised(coefficients, terms):
+    """Return the coefficients with further terms of zero."""
+    full = np.zeros((terms, *coefficients.shape[1:]))
+    full[:len(coefficients)] = coefficients
+    return full

@@ -1,0 +1,243 @@
+"""
+Objects in files: named tables of plain columns, as FITS or ASDF.
+
+A class that can be stored turns itself into tables of float64, integer,
+boolean and string columns, and is made from such tables again. Numbers stand
+in columns, never in header cards, which would cost digits; so what is read
+is what was written, bit by bit. Nothing is pickled.
+"""
+import warnings
+from io import BytesIO
+
+import numpy as np
+from astropy.io import fits, registry
+from astropy.io.fits.connect import is_fits
+
+__all__ = ['VERSION', 'check_version', 'storable']
+
+# Of the layout of the files. A reader takes every version up to its own.
+VERSION = 1
+
+
+class _Read(registry.UnifiedReadWrite):
+    """
+    Read an object of this class from a file.
+
+    Parameters
+    ----------
+    path : str, path-like or file-like
+        A FITS or ASDF file made by `write`.
+    format : {'fits', 'asdf'}, optional
+        Found from the content of the file where it is not given.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged, was made by a newer version, or holds
+        something else.
+    """
+
+    def __init__(self, instance, cls):
+        super().__init__(instance, cls, 'read')
+
+    def __call__(self, *args, **kwargs):
+        return self.registry.read(self._cls, *args, **kwargs)
+
+
+class _Write(registry.UnifiedReadWrite):
+    """
+    Write the object to a file.
+
+    Parameters
+    ----------
+    path : str, path-like or file-like
+        Where to write.
+    format : {'fits', 'asdf'}, optional
+        Found from the name of the file where it is not given.
+    overwrite : bool, optional
+        Whether an existing file is replaced.
+
+    Raises
+    ------
+    OSError
+        If the file exists and ``overwrite`` is not set.
+    """
+
+    def __init__(self, instance, cls):
+        super().__init__(instance, cls, 'write')
+
+    def __call__(self, *args, **kwargs):
+        self.registry.write(self._instance, *args, **kwargs)
+
+
+def storable(cls):
+    """
+    Give a class ``read`` and ``write``; used as its decorator.
+
+    The class has ``_to_tables()``, which returns a dict of tables, each a
+    dict of columns; the class method ``_from_tables(tables)``, the inverse
+    of it; and ``_columns``, which maps the names of its tables to dicts of
+    column names and units. Further tables may come with them.
+    """
+    cls.read = registry.UnifiedReadWriteMethod(_Read)
+    cls.write = registry.UnifiedReadWriteMethod(_Write)
+    formats = {'fits': (is_fits, _read_fits, _write_fits),
+               'asdf': (_is_asdf, _read_asdf, _write_asdf)}
+    for name, (identify, read, write) in formats.items():
+        registry.register_identifier(name, cls, identify)
+        with registry.delay_doc_updates(cls):
+            registry.register_reader(name, cls, _bound(read, cls))
+            registry.register_writer(name, cls, write)
+    return cls
+
+
+def _bound(read, cls):
+    def reader(file):
+        return read(cls, file)
+    return reader
+
+
+def check_version(version, name):
+    """Raise unless files of this version can be read."""
+    if not 1 <= version <= VERSION:
+        msg = (f'{name} must be of version {VERSION} or older, got version '
+               f'{version}: it was written by a newer photutils_mgauss')
+        raise ValueError(msg)
+
+
+def complete(cls, tables, name):
+    """Return an object made of tables, if no column is missing."""
+    missing = [f'{column!r} of {table!r}'
+               for table, columns in cls._columns.items()
+               for column in columns if column not in tables.get(table, {})]
+    if missing:
+        msg = (f'{name} must hold all columns of a {cls.__name__}, got none '
+               f'for {", ".join(missing)}')
+        raise ValueError(msg)
+    return cls._from_tables(tables)
+
+
+def _write_fits(stored, file, *, overwrite=False):
+    cls = type(stored)
+    primary = fits.PrimaryHDU()
+    primary.header['MGCLASS'] = cls.__name__, 'what the file holds'
+    primary.header['MGVERS'] = VERSION, 'version of the layout'
+    hdus = [_table_hdu(name, columns, cls._columns.get(name, {}))
+            for name, columns in stored._to_tables().items()]
+    fits.HDUList([primary, *hdus]).writeto(file, overwrite=overwrite,
+                                           checksum=True)
+
+
+def _table_hdu(name, columns, units):
+    made = [_fits_column(column, np.asarray(values), units.get(column))
+            for column, values in columns.items()]
+    return fits.BinTableHDU.from_columns(made, name=name.upper())
+
+
+def _fits_column(name, values, unit):
+    size = int(np.prod(values.shape[1:]))
+    if values.dtype.kind == 'U':
+        values = np.char.encode(values, 'utf-8')
+        letter = f'{max(values.itemsize, 1)}A'
+    else:
+        letter = str(size) + {'f': 'D', 'b': 'L', 'i': 'K'}[values.dtype.kind]
+    dim = str(values.shape[:0:-1]) if values.ndim > 2 else None
+    return fits.Column(name.upper(), letter, unit=unit or None, dim=dim,
+                       array=values)
+
+
+def _read_fits(cls, file):
+    try:
+        with warnings.catch_warnings():
+            # Astropy only warns of truncation and of wrong checksums.
+            warnings.simplefilter('error')
+            with fits.open(file, checksum=True, memmap=False) as hdus:
+                header = hdus[0].header.copy()
+                tables = {hdu.name.lower(): _plain_columns(hdu)
+                          for hdu in hdus[1:]}
+    except FileNotFoundError:
+        raise
+    except (OSError, Warning, TypeError, ValueError, KeyError,
+            IndexError) as error:
+        raise _damaged(file, error) from error
+    _check_class(header.get('MGCLASS'), cls, file)
+    check_version(header.get('MGVERS', 0), 'file')
+    return complete(cls, tables, 'file')
+
+
+def _plain_columns(hdu):
+    return {name.lower(): _native(hdu.data[name]) for name in hdu.data.names}
+
+
+def _native(column):
+    column = np.array(column)
+    if column.dtype.kind in 'SU':
+        return column.astype(str)
+    return column.astype(column.dtype.newbyteorder('='))
+
+
+def _damaged(file, error):
+    name = getattr(file, 'name', file)
+    return ValueError(f'file must be undamaged, got {name}: {error}')
+
+
+def _check_class(found, cls, file):
+    if found != cls.__name__:
+        msg = (f'file must hold a {cls.__name__}, got '
+               f'{getattr(file, "name", file)} with '
+               f'{found or "nothing of this package"}')
+        raise ValueError(msg)
+
+
+def _is_asdf(origin, path, file, *args, **kwargs):
+    if origin == 'read' and file is not None:
+        where = file.tell()
+        start = file.read(5)
+        file.seek(where)
+        return start == b'#ASDF'
+    return path is not None and str(path).endswith('.asdf')
+
+
+def _write_asdf(stored, file, *, overwrite=False):
+    import asdf
+
+    from photutils_mgauss._asdf import enabled
+    if hasattr(file, 'write') or overwrite:
+        target = file
+    else:
+        target = open(file, 'xb')  # noqa: SIM115
+    with enabled():
+        asdf.AsdfFile({'psf': stored}).write_to(target)
+    if target is not file:
+        target.close()
+
+
+def _read_asdf(cls, file):
+    try:
+        found = _stored_in_asdf(file)
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        # Whatever YAML, blocks and schemas can go wrong with.
+        raise _damaged(file, error) from error
+    for value in found:
+        if isinstance(value, cls):
+            return value
+    names = ', '.join(type(value).__name__ for value in found)
+    _check_class(names, cls, file)
+    return None
+
+
+def _stored_in_asdf(file):
+    import asdf
+
+    from photutils_mgauss._asdf import CLASSES, enabled
+    with enabled(), warnings.catch_warnings():
+        # An unknown version of a tag is only a warning of asdf.
+        warnings.simplefilter('error')
+        if hasattr(file, 'read'):
+            # asdf bypasses the buffer of files that others have looked into.
+            file = BytesIO(file.read())
+        with asdf.open(file) as opened:
+            return [value for value in opened.tree.values()
+                    if type(value).__name__ in CLASSES]

@@ -1,0 +1,368 @@
+"""The tables of a solution, with the Gaia catalogue's column names."""
+from dataclasses import replace
+
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from photutils_mgauss._fit_motions import (
+    data_chi2,
+    measured,
+    prior_rank,
+)
+from photutils_mgauss._joint import parallax_leak, parts, run, solve_all
+from photutils_mgauss._parallax import tdb
+from photutils_mgauss._stacked import invert_2x2
+from photutils_mgauss._tangent_plane import directions
+from photutils_mgauss.alignment import judge
+
+# What each bit of a star's flags means.
+FLAGS = {
+    1: ('no_solution: too few detections, or too short a time, for the '
+        'parameters asked for; all are NaN'),
+    2: ('bad_error: a detection had an error that is not positive, or a '
+        'singular covariance; it has no weight'),
+    4: ('bad_position: a detection had a position that is not finite, or '
+        'outside the bounding box of the WCS; it is left out'),
+    8: 'outlier: a detection was rejected as an outlier',
+    16: ('ambiguous: another pairing of detections lay within the tolerance '
+         'of the match'),
+    32: ('reference_rejected: a reference object whose catalogue values the '
+         'data contradict; it was treated as any other star'),
+    64: 'held_out: a reference object kept back for validation',
+    128: ('parallax_correlated: no parallax was fitted, and parallax and '
+          'motion would correlate by more than 0.3: a parallax biases the '
+          'motion'),
+    256: 'relative: motions are relative to the mean of the stars',
+    512: ('inconsistent: the detections do not agree with one straight '
+          'motion; the star was not used to tie the frames'),
+}
+GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
+FROM_OURS = [0, 1, 4, 2, 3]  # position, parallax, motion
+STRONG = 0.3
+
+
+def visibility_periods(years, used):
+    """
+    Return the number of groups of detections (n,), far apart in time.
+
+    Groups are 4 days apart (as Gaia counts them), or 1 per cent of the
+    whole baseline where that is shorter.
+    """
+    order = np.argsort(np.nanmean(years, axis=1))
+    baseline = np.nanmax(years) - np.nanmin(years)
+    gap = min(4 / 365.25, baseline / 100)
+    last = np.full(used.shape[1], -np.inf)
+    count = np.zeros(used.shape[1], dtype=int)
+    for e in order:
+        now = np.broadcast_to(years[e], used.shape[1])
+        count += used[e] & (now - last > gap)
+        last = np.where(used[e], now, last)
+    return count
+
+
+def at_epoch(fit, year):
+    """
+    Return parameters (p, n) and covariances moved to a Julian year.
+
+    Positions are plane coordinates, no longer relative to an origin.
+    """
+    dt = year - fit.scene.working_year
+    values, covariance = fit.estimates.values, fit.estimates.covariance
+    size = len(values)
+    move = np.eye(size)
+    move[0, 2] = move[1, 3] = dt
+    if fit.scene.options.acceleration:
+        move[0, -2] = move[1, -1] = dt**2 / 2
+        move[2, -2] = move[3, -1] = dt
+    values = move @ values
+    values[:2] += fit.scene.origin
+    covariance = np.einsum('ij,jkn,lk->iln', move, covariance, move)
+    return values, covariance
+
+
+def _inverse_2x2(matrix):
+    (a, b), (c, d) = matrix
+    return np.stack([np.stack([d, -b]), np.stack([-c, a])]) / (a * d - b * c)
+
+
+def turned(plane, values, covariance):
+    """
+    Return values and covariances in local axes instead of the plane's.
+
+    The position stays in plane coordinates, its covariance turns.
+    """
+    size = len(values)
+    inverse = _inverse_2x2(plane.local_jacobian(values[:2]))
+    turn = np.zeros((size, size, values.shape[1]))
+    turn[np.arange(size), np.arange(size)] = 1.0
+    pairs = [0, 2] + ([size - 2] if size > 5 else [])
+    for k in pairs:
+        turn[k:k + 2, k:k + 2] = inverse
+    moved = np.einsum('ijn,jn->in', turn, values)
+    moved[:2] = values[:2]
+    half = np.einsum('ijn,jkn->ikn', turn, covariance)
+    return moved, np.einsum('ijn,kjn->ikn', half, turn)
+
+
+def star_table(fit, ref_year):
+    """Return the `~astropy.table.QTable` of the stars."""
+    sightings = fit.scene.sightings
+    values, covariance = at_epoch(fit, ref_year)
+    if sightings.plane is not None:
+        values, covariance = turned(sightings.plane, values, covariance)
+    flags, solved = _flags(fit)
+    values[:, ~solved] = np.nan
+    covariance[..., ~solved] = np.nan
+    table = QTable({'id': sightings.names})
+    _add_parameters(table, fit, values, covariance)
+    table['ref_epoch'] = np.full(len(table), ref_year) * u.yr
+    _add_quality(table, fit, solved)
+    if not fit.scene.options.parallax and sightings.plane is not None:
+        flags |= _add_leak(table, fit, solved)
+    table['flux'] = _mean_flux(sightings.flux)
+    table['reference'] = _reference_kinds(fit)
+    table['flags'] = flags
+    table.meta['TIMESYS'] = 'TDB'
+    return table
+
+
+def _add_parameters(table, fit, values, covariance):
+    unit = u.Unit(fit.scene.sightings.unit)
+    has_parallax = bool(fit.scene.options.parallax)
+    values, covariance, extra = _gaia_order(values, covariance, has_parallax,
+                                            fit.scene.options.acceleration)
+    sigma = np.sqrt(np.stack([covariance[k, k] for k in range(5)]))
+    units = (unit, unit, unit, unit / u.yr, unit / u.yr)
+    plane = fit.scene.sightings.plane
+    if plane is not None:
+        ra, dec = directions(plane.deproject(values[:2]))
+        table['ra'], table['dec'] = ra * u.deg, dec * u.deg
+    else:
+        table['x'], table['y'] = values[:2] * unit
+    for k, name in enumerate(GAIA):
+        if k > 1:
+            table[name] = values[k] * units[k]
+        table[f'{name}_error'] = sigma[k] * units[k]
+    for i in range(5):
+        for j in range(i + 1, 5):
+            with np.errstate(invalid='ignore'):
+                rho = covariance[i, j] / (sigma[i] * sigma[j])
+            table[f'{GAIA[i]}_{GAIA[j]}_corr'] = rho
+    for k, name in enumerate(('accra', 'accdec')):
+        if extra is not None:
+            table[name] = extra[0][k] * unit / u.yr**2
+            table[f'{name}_error'] = extra[1][k] * unit / u.yr**2
+
+
+def _gaia_order(values, covariance, has_parallax, acceleration):
+    """Return five parameters in Gaia's order, and accelerations."""
+    n = values.shape[1]
+    extra = None
+    if acceleration:
+        extra = values[-2:], np.sqrt(np.stack([covariance[-2, -2],
+                                               covariance[-1, -1]]))
+    size = 5 if has_parallax else 4
+    full = np.full((5, n), np.nan)
+    full[:size] = values[:size]
+    matrix = np.full((5, 5, n), np.nan)
+    matrix[:size, :size] = covariance[:size, :size]
+    return full[FROM_OURS], matrix[FROM_OURS][:, FROM_OURS], extra
+
+
+def _flags(fit):
+    """Return flags (n,) and which stars have a solution."""
+    sightings, state = fit.scene.sightings, fit.state
+    seen = sightings.matches.seen
+    finite = np.isfinite(sightings.places).all(axis=0)
+    solved = np.isfinite(fit.estimates.values).all(axis=0)
+    periods = visibility_periods(sightings.years, state.used)
+    known = np.zeros(len(solved), dtype=bool)
+    known[fit.problem.priors.stars] = prior_rank(fit.problem.priors) > 1
+    solved &= (periods > 1) | (known & (periods > 0))
+    stars = np.arange(len(solved))
+    relative = fit.scene.relative and fit.scene.transform.kind != 'none'
+    marks = {
+        1: ~solved,
+        2: (finite & ~sightings.usable).any(axis=0),
+        4: (seen & ~finite).any(axis=0),
+        8: (sightings.usable & ~state.used).any(axis=0),
+        16: sightings.matches.ambiguous,
+        32: np.isin(stars, state.dropped),
+        64: np.isin(stars, fit.scene.held),
+        512: state.untied,
+        256: np.full(len(solved), relative),
+    }
+    return sum(bit * mark.astype(int) for bit, mark in marks.items()), solved
+
+
+def _add_quality(table, fit, solved):
+    sightings, state = fit.scene.sightings, fit.state
+    used = state.used.sum(axis=0)
+    chi2 = data_chi2(fit.estimates, fit.problem)
+    rank = np.zeros(len(used), dtype=int)
+    priors = fit.problem.priors
+    if len(priors.stars):
+        rank[priors.stars] = prior_rank(priors)
+        chi2[priors.stars] += priors.chi2(fit.estimates.values)
+    dof = (2 * used + rank - fit.problem.n_parameters).astype(float)
+    tested = solved & (dof > 0)
+    table['n_obs'] = sightings.matches.seen.sum(axis=0)
+    table['n_good_obs'] = used
+    table['visibility_periods_used'] = visibility_periods(sightings.years,
+                                                          state.used)
+    table['chi2'] = np.where(tested, chi2, np.nan)
+    table['dof'] = np.where(tested, dof, np.nan)
+    with np.errstate(invalid='ignore', divide='ignore'):
+        table['uwe'] = np.sqrt(table['chi2'] / table['dof'])
+
+
+def _add_leak(table, fit, solved):
+    """Add what an ignored parallax does to the motion; return its flag."""
+    problem = replace(fit.problem, observer=fit.scene.observer)
+    leaks = run(fit.scene.options.executor, parallax_leak, parts(problem))
+    correlation, leak = (np.concatenate(some, axis=-1)
+                         for some in zip(*leaks, strict=True))
+    inverse = _inverse_2x2(fit.scene.sightings.plane.local_jacobian(
+        fit.scene.origin))
+    leak = np.einsum('ijn,jn->in', inverse, leak)
+    strongest = np.where(solved, np.abs(correlation).max(axis=0), np.nan)
+    table['parallax_motion_corr'] = strongest
+    for k, name in enumerate(('pmra', 'pmdec')):
+        table[f'{name}_per_parallax'] = np.where(solved, leak[k],
+                                                 np.nan) / u.yr
+    return 128 * (np.nan_to_num(strongest) > STRONG).astype(int)
+
+
+def _mean_flux(flux):
+    count = np.isfinite(flux).sum(axis=0)
+    with np.errstate(invalid='ignore'):
+        return np.nansum(flux, axis=0) / np.where(count, count, np.nan)
+
+
+def _reference_kinds(fit):
+    sightings, scene = fit.scene.sightings, fit.scene
+    out = np.full(len(sightings.names), '', dtype='U8')
+    seen = sightings.references >= 0
+    kinds = 'qso' if sightings.catalogue is None else (
+        sightings.catalogue.kinds[seen])
+    out[sightings.references[seen]] = kinds
+    out[scene.held] = ''
+    out[fit.state.dropped] = ''
+    return out
+
+
+def alignment_table(fit, wcs_residuals):
+    """Return the `~astropy.table.QTable` of the epochs' maps."""
+    scene, state = fit.scene, fit.state
+    sightings, transform = scene.sightings, scene.transform
+    unit = u.Unit(sightings.unit)
+    centre = np.array(transform.centre)[:, None]
+    shift, slope, errors = [], [], []
+    for e, coefficients in enumerate(state.maps):
+        shift.append(_whole_shift(transform, coefficients, centre,
+                                  sightings.ties[e]))
+        slope.append(_whole_slope(transform, coefficients, centre,
+                                  sightings.ties[e]))
+        errors.append(_shift_errors(fit, e))
+    table = QTable()
+    table['epoch'] = np.arange(len(state.maps))
+    table['time'] = tdb(sightings.epoch_years)
+    table['shift'] = np.array(shift) * unit
+    table['shift_error'] = np.array(errors) * unit
+    table['matrix'] = np.array(slope)
+    table['coefficients'] = state.maps * unit
+    _add_counts(table, fit, unit)
+    table['systematic'] = np.sqrt(state.floor) * unit
+    table['wcs_residual'] = np.array(wcs_residuals) * u.mas
+    table.meta.update(kind=transform.kind, degree=transform.degree,
+                      xcentre=transform.centre[0],
+                      ycentre=transform.centre[1], scale=transform.scale)
+    return table
+
+
+def _whole_shift(transform, coefficients, centre, tie):
+    """Return the shift at the centre, or for a tied plane that of (0, 0)."""
+    if tie is not None:
+        return transform.apply(coefficients, tie[:, :1])[:, 0]
+    return (transform.apply(coefficients, centre) - centre)[:, 0]
+
+
+def _whole_slope(transform, coefficients, centre, tie):
+    slope = transform.jacobian(coefficients, centre)[..., 0]
+    return slope if tie is None else slope @ tie[:, 1:]
+
+
+def _shift_errors(fit, e):
+    """Return the errors of a map's shift at the centre of the field."""
+    b = fit.scene.transform.n_terms
+    covariance = fit.frames.covariance(e)
+    return np.sqrt(np.diag(covariance)[[0, b]])
+
+
+def _add_counts(table, fit, unit):
+    scene, state = fit.scene, fit.state
+    sightings = scene.sightings
+    stars = scene.anchors.copy()
+    stars[state.dropped] = False
+    used = state.used & stars
+    table['n_references'] = used.sum(axis=1)
+    lost = sightings.usable & ~state.used & scene.anchors
+    lost |= sightings.usable & np.isin(np.arange(len(stars)), state.dropped)
+    table['n_rejected'] = lost.sum(axis=1)
+    square = np.where(used, fit.estimates.residuals, np.nan)**2
+    with np.errstate(invalid='ignore'):
+        count = np.isfinite(square).sum(axis=2)
+        rms = np.sqrt(np.nansum(square, axis=2) / np.where(count, count,
+                                                           np.nan))
+    table['rms'] = rms.T * unit
+
+
+def residual_table(fit):
+    """Return the `~astropy.table.QTable` of all detections."""
+    scene, sightings = fit.scene, fit.scene.sightings
+    epoch, star = np.nonzero(sightings.matches.seen)
+    at = (epoch, star)
+    full = solve_all(fit.problem, fit.frames.correction, fit.frames.factor,
+                     scene.options.executor, residuals=True, leverage=True)
+    covariance = measured(scene, fit.state)
+    judgement = judge(full, covariance, fit.problem.weights)
+    unit = u.Unit(sightings.unit)
+    finite = np.isfinite(sightings.places).all(axis=0)
+    table = QTable({'epoch': epoch, 'id': sightings.names[star],
+                    'row': sightings.matches.rows[at]})
+    years = np.broadcast_to(sightings.years, finite.shape)[at]
+    table['time'] = years * u.yr
+    _add_aligned(table, fit, at, finite, unit)
+    residual = np.where(finite, full.residuals, np.nan)
+    left_out = _leave_one_out(full, covariance, judgement)
+    for k, name in enumerate(('dra', 'ddec')):
+        table[name] = residual[k][at] * unit
+        table[f'{name}_error'] = np.sqrt(covariance[2 * k][at]) * unit
+        table[f'{name}_left_out'] = left_out[k][at] * unit
+    table['chi2'] = judgement.chi2[at]
+    table['used'] = fit.state.used[at]
+    return table
+
+
+def _add_aligned(table, fit, at, finite, unit):
+    scene, sightings = fit.scene, fit.scene.sightings
+    aligned = np.stack([scene.transform.apply(one, sightings.places[:, e])
+                        for e, one in enumerate(fit.state.maps)], axis=1)
+    if sightings.plane is not None:
+        ra, dec = directions(sightings.plane.deproject(aligned))
+        table['ra'], table['dec'] = ra[at] * u.deg, dec[at] * u.deg
+    else:
+        table['x'], table['y'] = (axis[at] * unit for axis in aligned)
+
+
+def _leave_one_out(estimates, covariance, judgement):
+    """Return residuals (2, E, n) from fits without the detection itself."""
+    x, y = estimates.residuals
+    left = invert_2x2(*(covariance - estimates.predicted))
+    xx, xy, yy = covariance
+    # Infinite where a detection alone fixes its star: left out below.
+    with np.errstate(invalid='ignore'):
+        a, b = left[0] * x + left[1] * y, left[1] * x + left[2] * y
+        out = np.stack([xx * a + xy * b, xy * a + yy * b])
+    return np.where(np.isfinite(judgement.chi2), out, np.nan)

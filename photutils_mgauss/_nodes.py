@@ -1,0 +1,244 @@
+r"""
+Mixtures for every node of a grid of PSF images, and how good they are.
+
+The pixel-phase error is the shift that a star would seem to have if its
+pixels were the image's and its model the mixture: the residual :math:`r` is
+projected, for many places of the star within a pixel, onto flux and position,
+
+.. math::
+
+    \delta = (D^T D)^{-1} D^T r, \qquad
+    D = F\,[P, -\partial_x P, -\partial_y P].
+
+A shift that is the same at all phases is a matter of definition; half the
+range over the phases is the error.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.table import QTable
+from scipy.ndimage import map_coordinates, spline_filter
+from tqdm.auto import tqdm
+
+from photutils_mgauss._parallel import available_cores
+from photutils_mgauss._validation import as_choice, as_integer, as_real
+from photutils_mgauss.fitting import fit_mixture
+from photutils_mgauss.shapes import adaptive_moments
+
+__all__ = ['NodeImages', 'fit_nodes', 'plain_report']
+
+# Phases of the star within a pixel, along each axis.
+_PHASES = 4
+# Stars are rarely fitted on more than 11 x 11 pixels.
+_PHASE_RADIUS = 5.5
+
+
+@dataclass(frozen=True, eq=False)
+class NodeImages:
+    """
+    PSF images at M places.
+
+    Attributes
+    ----------
+    images : (M, ny, nx) `~numpy.ndarray`
+        Flux densities; all zero or all NaN where there is no PSF.
+    positions : (M, 2) `~numpy.ndarray`
+        The places (x, y) [pix].
+    oversampling : (y, x) tuple of int
+        Samples per unit of ``unit``.
+    origin : (x, y) tuple of float
+        The sample that is the star's position.
+    unit : float
+        The length that ``oversampling`` divides [pix]; 1 unless the sampling
+        is not an integer.
+    """
+
+    images: np.ndarray
+    positions: np.ndarray
+    oversampling: tuple = (1, 1)
+    origin: tuple = None
+    unit: float = 1.0
+
+    @property
+    def centre(self):
+        """The origin, by default the middle of the images."""
+        if self.origin is not None:
+            return tuple(self.origin)
+        return tuple((n - 1) / 2 for n in self.images.shape[:0:-1])
+
+    def widest_radius(self):
+        """
+        Return the radius of the circle that stays off the edge [unit].
+
+        Two samples are left: some libraries put fill values into the first.
+        """
+        ny, nx = self.images.shape[1:]
+        x, y = self.centre
+        return min((min(x, nx - 1 - x) - 2) / self.oversampling[1],
+                   (min(y, ny - 1 - y) - 2) / self.oversampling[0])
+
+    @property
+    def blank(self):
+        """Which places have no PSF, (M,) bool."""
+        flat = self.images.reshape(len(self.images), -1)
+        return ((flat == 0) | np.isnan(flat)).all(axis=1)
+
+    def filled_borders(self):
+        """
+        Return the mask (M, ny, nx) of borders that hold one value only.
+
+        A row of exactly equal numbers was not measured.
+        """
+        mask = np.zeros(self.images.shape, bool)
+        for axis in (1, 2):
+            lines = np.moveaxis(self.images, axis, 0)
+            constant = (lines == lines[..., :1]).all(axis=-1)
+            outer = np.logical_and.accumulate(constant)
+            outer |= np.logical_and.accumulate(constant[::-1])[::-1]
+            np.moveaxis(mask, axis, 0)[outer] = True
+        return mask & ~self.blank[:, None, None]
+
+
+def fit_nodes(nodes, n_components, *, radius=None, start='centre',
+              executor=None, progress_bar=False, **kwargs):
+    """
+    Fit a mixture to every image.
+
+    Parameters
+    ----------
+    nodes : NodeImages
+        The images.
+    n_components : int
+        The number K of Gaussians.
+    radius : float, optional
+        Only samples this near to the peak are fitted [pix].
+    start : {'centre', 'own'}, optional
+        Whether all but the middle node start from the fit of that one, or
+        each looks for its own start.
+    executor : `~concurrent.futures.Executor`, optional
+        Where to fit.
+    progress_bar : bool, optional
+        Whether to show one.
+    **kwargs
+        Further keywords of `fit_mixture`.
+
+    Returns
+    -------
+    list of GaussianMixture or None
+    scales : (M,) `~numpy.ndarray`
+        The flux of each image; NaN where there is no mixture.
+    report : `~astropy.table.QTable`
+    """
+    as_choice(start, 'start', ('centre', 'own'))
+    as_integer(n_components, 'n_components', minimum=1)
+    radius = (nodes.widest_radius() if radius is None
+              else as_real(radius, 'radius', above=0) / nodes.unit)
+    mask = nodes.filled_borders()
+    if 'mask' in kwargs:
+        mask = mask | np.asarray(kwargs.pop('mask'), bool)
+    options = {'oversampling': nodes.oversampling, 'origin': nodes.centre,
+               'radius': radius, 'executor': executor, **kwargs}
+    images = np.where(mask, 0.0, nodes.images)
+    first = _first_fit(images, mask, nodes, n_components, options, start)
+    fits = []
+    for chunk in _chunks(len(images), progress_bar):
+        fits += fit_mixture(images[chunk], n_components, mask=mask[chunk],
+                            start=first, **options)
+    report = _report(nodes, images, mask, fits, radius, executor)
+    mixtures = [fit.mixture and fit.mixture.affine(nodes.unit * np.eye(2))
+                if nodes.unit != 1 else fit.mixture for fit in fits]
+    return mixtures, np.array([fit.flux for fit in fits]), report
+
+
+def _first_fit(images, mask, nodes, n_components, options, start):
+    """Return the mixture of the node nearest to the middle that has one."""
+    if start == 'own' or len(images) == 1:
+        return None
+    middle = (nodes.positions.min(axis=0) + nodes.positions.max(axis=0)) / 2
+    distance = np.hypot(*(nodes.positions - middle).T)
+    distance[nodes.blank] = np.inf
+    for node in np.argsort(distance)[:3]:
+        fit, = fit_mixture(images[[node]], n_components, mask=mask[[node]],
+                           **{**options, 'executor': None})
+        if fit.status.usable:
+            return fit.mixture
+    return None
+
+
+def _chunks(n, progress_bar):
+    """Yield slices of nodes, under a progress bar if one is wanted."""
+    size = max(32 * available_cores(), -(-n // 40)) if progress_bar else n
+    with tqdm(total=n, desc='Fitting nodes', disable=not progress_bar) as bar:
+        for i in range(0, n, size):
+            yield slice(i, min(i + size, n))
+            bar.update(min(size, n - i))
+
+
+def _report(nodes, images, mask, fits, radius, executor):
+    """Return the table of all nodes."""
+    models = np.array([image - fit.residual
+                       for image, fit in zip(images, fits, strict=True)])
+    shape_of = {'oversampling': nodes.oversampling, 'origin': nodes.centre,
+                'executor': executor}
+    truth = adaptive_moments(images, mask=mask, **shape_of)
+    model = adaptive_moments(models, **shape_of)
+    table = plain_report(nodes.positions,
+                         [fit.mixture.n_components if fit.mixture else 0
+                          for fit in fits],
+                         np.array([fit.flux for fit in fits]))
+    table['chi2'] = [fit.chi2 for fit in fits]
+    table['size_error'] = truth.relative_size_error(model)
+    table['ellipticity_error'] = truth.ellipticity_error(model)
+    table['e1'], table['e2'] = truth.e1, truth.e2
+    table['phase_error'] = [
+        _phase_error(nodes, fit, min(radius, _PHASE_RADIUS / nodes.unit))
+        for fit in fits]
+    table['enclosed_flux'] = [fit.enclosed_flux for fit in fits]
+    table['status'] = [int(fit.status) for fit in fits]
+    table['message'] = [fit.message for fit in fits]
+    return table
+
+
+def plain_report(positions, n_components, scales):
+    """Return the table of mixtures that were given, not fitted."""
+    n = len(positions)
+    nan = np.full(n, np.nan)
+    return QTable({
+        'id': np.arange(1, n + 1), 'x': positions[:, 0].astype(float),
+        'y': positions[:, 1].astype(float),
+        'n_components': np.array(n_components, int), 'scale': scales,
+        'chi2': nan, 'size_error': nan, 'ellipticity_error': nan, 'e1': nan,
+        'e2': nan, 'phase_error': nan, 'enclosed_flux': nan,
+        'bridged': np.zeros(n, bool), 'status': np.full(n, -1),
+        'message': np.full(n, 'The mixture was given, not fitted.')})
+
+
+def _phase_error(nodes, fit, radius):
+    """Return half the range of the shift over the pixel phases [pix]."""
+    if fit.mixture is None:
+        return np.nan
+    step = 1 / nodes.unit
+    half = int(radius / step)
+    grid = np.arange(-half, half + 1) * step
+    phase = np.arange(_PHASES) / _PHASES * step
+    x = (grid + phase[:, None])[None, :, None, :]
+    y = (grid + phase[:, None])[:, None, :, None]
+    x, y = (a.reshape(_PHASES**2, -1) for a in np.broadcast_arrays(x, y))
+    inside = np.hypot(x, y) <= radius
+    scale = np.array(nodes.oversampling[::-1])
+    places = np.stack([y * scale[1] + nodes.centre[1],
+                       x * scale[0] + nodes.centre[0]])
+    residual = map_coordinates(spline_filter(fit.residual), places,
+                               prefilter=False, mode='nearest')
+    shift = _shifts(fit, x, y, np.where(inside, residual, 0), inside)
+    return float(np.ptp(shift, axis=0).max() / 2 * nodes.unit)
+
+
+def _shifts(fit, x, y, residual, inside):
+    """Return the shifts (phases, 2) that the residuals look like."""
+    design = np.concatenate([fit.mixture.evaluate(x, y)[..., None],
+                             -fit.mixture.gradient(x, y)], axis=-1)
+    design *= fit.flux * inside[..., None]
+    normal = np.einsum('pni,pnj->pij', design, design)
+    right = np.einsum('pni,pn->pi', design, residual)
+    return np.linalg.solve(normal, right[..., None])[:, 1:, 0]

@@ -1,0 +1,132 @@
+"""Tables and flags of PSF photometry, as photutils makes them."""
+import numpy as np
+from astropy.units import Quantity
+
+from photutils_mgauss import _compat
+
+# Bits of the ``flags`` column, see photutils.psf.decode_psf_flags.
+PARTIAL = 1
+OUTSIDE_IMAGE = 2
+NON_POSITIVE_FLUX = 4
+NO_CONVERGENCE = 8
+NO_COVARIANCE = 16
+NEAR_BOUND = 32
+NO_OVERLAP = 64
+FULLY_MASKED = 128
+TOO_FEW_PIXELS = 256
+NON_FINITE_POSITION = 512
+NON_FINITE_FLUX = 1024
+NON_FINITE_LOCAL_BKG = 2048
+OUTSIDE_FIT_REGION = 4096
+
+# How near a bound is near, in the unit of the parameter.
+_BOUND_TOLERANCE = 0.01
+
+
+def plain(column):
+    """Return a column as a plain array without its unit."""
+    return np.asarray(column.value if isinstance(column, Quantity)
+                      else column, dtype=float)
+
+
+def define_flags(result, fit_shape, data_shape):
+    """
+    Return the flags of all stars.
+
+    Parameters
+    ----------
+    result : FitResult
+        Inputs and results, one row for each star.
+    fit_shape, data_shape : (ny, nx) tuple
+        The shapes of the fitted region and of the image.
+
+    Returns
+    -------
+    (n,) `~numpy.ndarray` of int
+    """
+    flags = result.reasons.copy()
+    flux, x, y = result.values.T
+    height, width = data_shape
+
+    def mark(where, bit):
+        flags[where] |= bit
+
+    mark(result.n_pixels < fit_shape[0] * fit_shape[1], PARTIAL)
+    mark((x < -0.5) | (y < -0.5) | (x > width - 0.5) | (y > height - 0.5),
+         OUTSIDE_IMAGE)
+    mark(flux <= 0, NON_POSITIVE_FLUX)
+    mark(result.valid & ~result.converged, NO_CONVERGENCE)
+    mark(~result.has_covariance, NO_COVARIANCE)
+    mark(_near_bound(result), NEAR_BOUND)
+    mark(~(np.isfinite(x) & np.isfinite(y)), NON_FINITE_POSITION)
+    mark(~np.isfinite(flux), NON_FINITE_FLUX)
+    mark(~np.isfinite(result.local_bkg), NON_FINITE_LOCAL_BKG)
+    if _compat.FLAGS_FIT_REGION:
+        mark(_outside_fit_region(result, fit_shape, data_shape),
+             OUTSIDE_FIT_REGION)
+    return flags
+
+
+def _near_bound(result):
+    near = np.zeros(result.valid.size, bool)
+    for bounds in (result.lower, result.upper):
+        with np.errstate(invalid='ignore'):
+            close = np.abs(bounds - result.values) <= _BOUND_TOLERANCE
+        near |= close[:, result.flagged_bounds].any(axis=1)
+    return near & result.valid
+
+
+def _outside_fit_region(result, fit_shape, data_shape):
+    outside = np.zeros(result.valid.size, bool)
+    for axis, k in ((0, 2), (1, 1)):
+        start = np.ceil(result.initial[:, k] - fit_shape[axis] / 2)
+        low = np.maximum(start, 0) - 0.5
+        high = np.minimum(start + fit_shape[axis], data_shape[axis]) - 0.5
+        outside |= (result.values[:, k] < low) | (result.values[:, k] > high)
+    return outside
+
+
+def fit_quality(result, n_free, has_error):
+    """
+    Return qfit, cfit and reduced_chi2 of all stars.
+
+    The first two are the sum of the absolute residuals and the residual of
+    the central pixel over the flux.
+    """
+    absolute, centre, squares = result.sums.T
+    flux = np.where(result.values[:, 0] == 0, np.nan, result.values[:, 0])
+    dof = (result.n_pixels - n_free).astype(float)
+    chi2 = np.full(flux.size, np.nan)
+    if has_error:
+        np.divide(squares, dof, out=chi2, where=dof > 0)
+    # Adding zero makes a negative zero positive.
+    return absolute / flux + 0.0, centre / flux + 0.0, chi2
+
+
+def make_columns(result, quality, flags, unit):
+    """Return the columns that photutils puts behind the initial ones."""
+    columns = {}
+    for name, k in (('x', 1), ('y', 2), ('flux', 0)):
+        columns[f'{name}_fit'] = result.values[:, k].copy()
+    for name, k in (('x', 1), ('y', 2), ('flux', 0)):
+        columns[f'{name}_err'] = result.errors[:, k]
+    if unit is not None:
+        for name in ('flux_fit', 'flux_err'):
+            columns[name] = columns[name] << unit
+    columns['n_pixels_fit'] = result.n_pixels
+    columns['qfit'], columns['cfit'], columns['reduced_chi2'] = quality
+    columns['flags'] = flags
+    return columns
+
+
+def assemble(init_params, group_size, columns, meta):
+    """Return the table of results, sorted by id as photutils does."""
+    rows = np.argsort(np.asarray(init_params['id']), kind='stable')
+    table = {}
+    for name in init_params.colnames:
+        table[name] = init_params[name][rows]
+        if name == 'group_id':
+            table['group_size'] = group_size[rows]
+    for name, column in columns.items():
+        table[name] = column[rows]
+    return _compat.results_table(table, meta), rows

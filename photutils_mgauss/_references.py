@@ -1,0 +1,246 @@
+"""
+Reference objects: what is known of some stars before anything is measured.
+
+Classes, one per object: 'qso' (or 'galaxy': motion and parallax zero),
+'star' (a catalogue's motion, and position and parallax where it has them),
+'position' (a position without a motion: unknown, never zero).
+"""
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+from astropy.table import Table
+
+from photutils_mgauss._epoch import find_column, numbers
+from photutils_mgauss._joint import Priors
+from photutils_mgauss._parallax import julian_years
+from photutils_mgauss._stacked import apply
+from photutils_mgauss._tangent_plane import unit_vectors
+
+CLASSES = ('qso', 'galaxy', 'star', 'position')
+GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
+UNKNOWN = 1e30  # variance of what is not known
+ORDER = [0, 1, 3, 4, 2]  # Gaia's order to ours: position, motion, parallax
+# "Zero" motion and parallax of a quasar, in units of the frame's own: an
+# exact zero would make the equations singular.
+ZERO = {'mas': 1e-4, 'pix': 1e-6}
+# mas/yr^2 of perspective acceleration for unit motion [mas/yr], parallax
+# [mas] and radial velocity [km/s]: -2 / (4.74047 km/s * 206264806 mas).
+PERSPECTIVE = -2 / (4.740470446 * 206264806.24709636)
+
+
+@dataclass(frozen=True, eq=False)
+class Catalogue:
+    """
+    Reference objects as plain arrays; NaN where nothing is known.
+
+    ``values`` (5, k) and ``covariance`` (5, 5, k) are position, motion and
+    parallax on the plane [unit, unit/yr], at Julian years ``year`` (k,).
+    """
+
+    ids: np.ndarray | None
+    kinds: np.ndarray
+    values: np.ndarray
+    covariance: np.ndarray
+    year: np.ndarray
+    radial_velocity: np.ndarray
+
+    def motion(self):
+        """Return motions (2, k) as far as they are known."""
+        motion = self.values[2:4].copy()
+        motion[:, _fixed(self.kinds)] = 0
+        return motion
+
+
+def _fixed(kinds):
+    return np.isin(kinds, ('qso', 'galaxy'))
+
+
+def read_catalogue(table, plane, unit):
+    """Return the `Catalogue` of a table of references."""
+    n = len(table)
+    kinds = _kinds(table)
+    values = np.full((5, n), np.nan)
+    values[:2] = _positions(table, plane, unit)
+    per_year = _unit(unit) / u.yr
+    for k, name in ((2, 'pmra'), (3, 'pmdec')):
+        values[k] = _numbers(table, name, per_year)
+    values[4] = _numbers(table, 'parallax', _unit(unit))
+    covariance = _covariance(table, unit)
+    if plane is not None and np.isfinite(values[:2]).any():
+        turn = np.zeros((5, 5, n))
+        turn[:2, :2] = turn[2:4, 2:4] = plane.local_jacobian(values[:2])
+        turn[4, 4] = 1
+        values[2:4] = apply(turn[2:4, 2:4], values[2:4])
+        covariance = np.einsum('ijn,jkn,lkn->iln', turn, covariance, turn)
+    _check_motions(kinds, values)
+    ids = np.asarray(table['id']) if 'id' in table.colnames else None
+    return Catalogue(ids, kinds, values, covariance, _years(table, kinds),
+                     _numbers(table, 'radial_velocity', u.km / u.s))
+
+
+def _unit(unit):
+    return u.Unit('pix' if unit == 'pix' else 'mas')
+
+
+def _numbers(table, name, unit):
+    """Return a column as floats in ``unit``, NaN if there is none."""
+    if name not in table.colnames:
+        return np.full(len(table), np.nan)
+    column = table[name]
+    has = getattr(column, 'unit', None)
+    if has is None or has == '':
+        return np.ma.filled(np.ma.asarray(column, dtype=float), np.nan)
+    try:
+        return np.array(u.Quantity(
+            np.ma.filled(column, np.nan), has).to_value(unit), dtype=float)
+    except u.UnitConversionError as error:
+        msg = (f'column {name!r} of references must have a unit like '
+               f'{unit}, got {has}')
+        raise ValueError(msg) from error
+
+
+def _kinds(table):
+    if 'class' in table.colnames:
+        kinds = np.char.lower(np.asarray(table['class']).astype(str))
+        bad = ~np.isin(kinds, CLASSES)
+        if bad.any():
+            words = ', '.join(repr(kind) for kind in CLASSES)
+            msg = (f"the column 'class' of references must hold {words}, "
+                   f'got {kinds[bad][0]!r}')
+            raise ValueError(msg)
+        return kinds
+    if 'pmra' not in table.colnames or 'pmdec' not in table.colnames:
+        return np.full(len(table), 'position')
+    known = np.isfinite(_raw(table['pmra']) + _raw(table['pmdec']))
+    return np.where(known, 'star', 'position')
+
+
+def _raw(column):
+    values = getattr(column, 'value', column)
+    return np.ma.filled(np.ma.asarray(values, dtype=float), np.nan)
+
+
+def _positions(table, plane, unit):
+    if plane is not None:
+        if find_column(table, 'ra') is None:
+            return np.full((2, len(table)), np.nan)
+        return plane.project(unit_vectors(numbers(table, 'ra', u.deg),
+                                          numbers(table, 'dec', u.deg)))
+    if find_column(table, 'x') is None:
+        return np.full((2, len(table)), np.nan)
+    return np.stack([numbers(table, key, _unit(unit)) for key in 'xy'])
+
+
+def _covariance(table, unit):
+    """Return (5, 5, k) in our order; NaN rows where there is no error."""
+    angle = _unit(unit)
+    units = (angle, angle, angle, angle / u.yr, angle / u.yr)
+    errors = []
+    for name, one in zip(GAIA, units, strict=True):
+        column = f'{name}_error'
+        if column not in table.colnames and name in ('ra', 'dec'):
+            column = {'ra': 'x_error', 'dec': 'y_error'}[name]
+        error = _numbers(table, column, one)
+        errors.append(np.where(error > 0, error, np.nan))
+    out = np.empty((5, 5, len(table)))
+    for i, a in enumerate(GAIA):
+        for j, b in enumerate(GAIA):
+            name = f'{a}_{b}_corr' if i < j else f'{b}_{a}_corr'
+            rho = 1.0 if i == j else np.nan_to_num(
+                _numbers(table, name, None))
+            out[i, j] = rho * errors[i] * errors[j]
+    return _without_nan(out)[ORDER][:, ORDER]
+
+
+def _without_nan(covariance):
+    # Finite, so that rotating an unknown position does not make the known
+    # motion unknown.
+    size = len(covariance)
+    out = np.nan_to_num(covariance, nan=0.0)
+    for k in range(size):
+        out[k, k] = np.where(np.isnan(covariance[k, k]), UNKNOWN, out[k, k])
+    return out
+
+
+def _years(table, kinds):
+    if 'ref_epoch' not in table.colnames:
+        if (kinds == 'star').any() or (kinds == 'position').any():
+            msg = ("references must have a column 'ref_epoch' with the time "
+                   f'of their positions, got {table.colnames}')
+            raise ValueError(msg)
+        return np.full(len(table), np.nan)
+    return np.broadcast_to(julian_years(table['ref_epoch'], 'ref_epoch'),
+                           len(table)).copy()
+
+
+def _check_motions(kinds, values):
+    bad = (kinds == 'star') & ~np.isfinite(values[2:4]).all(axis=0)
+    if bad.any():
+        msg = ("references of class 'star' must have pmra and pmdec, got "
+               f"none in row {np.flatnonzero(bad)[0]}; class 'position' is "
+               'for stars of unknown motion')
+        raise ValueError(msg)
+
+
+def build_priors(catalogue, stars, origin, year, unit, n_parameters):
+    """
+    Return the `Priors` of references with the numbers ``stars``.
+
+    ``origin`` (2, k) are the places their positions are relative to, and
+    ``year`` the working epoch. ``n_parameters`` is 4, 5 (parallax), 6 or 7
+    (acceleration, about which catalogues say nothing).
+    """
+    has_parallax = n_parameters % 2 == 1
+    size = 5 if has_parallax else 4
+    k = len(stars)
+    precision = np.zeros((n_parameters, n_parameters, k))
+    moment = np.zeros((n_parameters, k))
+    constant = np.zeros(k)
+    for i in range(k):
+        matrix, covariance, value = _known(catalogue, i, origin[:, i], year,
+                                           unit, size)
+        weighted = np.linalg.solve(covariance, matrix)
+        precision[:size, :size, i] = matrix.T @ weighted
+        moment[:size, i] = value @ weighted
+        constant[i] = value @ np.linalg.solve(covariance, value)
+    order = np.argsort(stars)
+    return Priors(np.asarray(stars), precision, moment,
+                  constant).pick(order)
+
+
+def _known(catalogue, i, origin, year, unit, size):
+    """
+    Return what is known of reference i: matrix M, covariance and values.
+
+    The catalogue's values are M v for the parameters v at the working
+    epoch; rows without an error are left out.
+    """
+    value = catalogue.values[:, i].copy()
+    covariance = catalogue.covariance[..., i].copy()
+    matrix = np.eye(5)
+    if np.isfinite(catalogue.year[i]):
+        matrix[0, 2] = matrix[1, 3] = catalogue.year[i] - year
+    value[:2] -= origin
+    if _fixed(catalogue.kinds[i]):
+        value[2:] = 0
+        covariance[2:] = covariance[:, 2:] = 0
+        covariance[[2, 3, 4], [2, 3, 4]] = ZERO[unit]**2
+    if catalogue.kinds[i] == 'position':
+        value[2:] = np.nan
+    known = np.isfinite(value) & (np.diag(covariance) < 1e-3 * UNKNOWN)
+    known = np.flatnonzero(known[:size])
+    return (matrix[known, :size], covariance[np.ix_(known, known)],
+            value[known])
+
+
+def perspective(catalogue):
+    """Return known perspective accelerations (2, k) [unit/yr^2], 0 else."""
+    rate = (PERSPECTIVE * catalogue.values[4] * catalogue.radial_velocity
+            * catalogue.values[2:4])
+    return np.nan_to_num(rate)
+
+
+def is_table(references):
+    """Whether references came as a table."""
+    return isinstance(references, Table)

@@ -1,0 +1,160 @@
+r"""
+Motions relative to the mean of the stars, where nothing else fixes them.
+
+Without reference objects a field of motions :math:`A_i q` common to all stars
+cannot be told from maps that drift, :math:`r_e = q\,\Delta t_e`. It is chosen
+such that the weighted mean field of the stars' own motions is zero,
+
+.. math:: \mu_i' = \mu_i - A_i q, \quad q = P^{-1} c, \quad
+    c = \sum_j w_j A_j^T \mu_j, \quad P = \sum_j w_j A_j^T A_j,
+
+and the covariances follow from that same linear map. A common field of
+parallaxes (or accelerations) is treated alike.
+"""
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from photutils_mgauss._joint import _scaled_rows, eliminate, parts, run
+from photutils_mgauss._stacked import gram
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """
+    One kind of common field: which parameters, and how it may vary.
+
+    ``rows`` are the parameters of a star it changes, ``generators``
+    (len(rows) * b, m) the fields, ``drifts`` (E, 2 b, m) what the maps do.
+    """
+
+    rows: tuple
+    generators: np.ndarray
+    drifts: np.ndarray
+
+    def fields(self, basis):
+        """Return A_i, shape (len(rows), m, n)."""
+        blocks = self.generators.reshape(len(self.rows), len(basis), -1)
+        return np.einsum('rbm,bn->rmn', blocks, basis)
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Sums over stars: P (m, m), c (m,) and the frames' part (m, q)."""
+
+    normal: np.ndarray
+    moment: np.ndarray
+    frames: np.ndarray
+
+    def __add__(self, other):
+        return Sums(self.normal + other.normal, self.moment + other.moment,
+                    self.frames + other.frames)
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A part of the stars, with what is needed of all of them."""
+
+    problem: object
+    factor: np.ndarray
+    family: Family
+    weights: np.ndarray
+    values: np.ndarray
+    covariance: np.ndarray | None = None
+    inverse: np.ndarray | None = None
+    sums: Sums | None = None
+    spread: np.ndarray | None = None
+
+
+def _pieces(problem, frames, family, weights, estimates, **others):
+    start = 0
+    for part in parts(problem):
+        rows = slice(start, start + part.n_stars)
+        start = rows.stop
+        yield Piece(part, frames.factor, family, weights[rows],
+                    estimates.values[:, rows],
+                    estimates.covariance[..., rows], **others)
+
+
+def _frame_part(stars, factor):
+    """Return R^T Z C of all stars, shape (p, n, q)."""
+    return np.einsum('kin,knq->inq', stars.factor,
+                     _scaled_rows(stars, factor))
+
+
+def _accumulate(piece):
+    stars = eliminate(piece.problem)
+    rows, fields = list(piece.family.rows), piece.family.fields(stars.basis)
+    weighted = fields * piece.weights
+    values = np.nan_to_num(piece.values[rows])
+    return Sums(np.einsum('rmn,rkn->mk', weighted, fields),
+                np.einsum('rmn,rn->m', weighted, values),
+                np.einsum('rmn,rnq->mq', weighted,
+                          _frame_part(stars, piece.factor)[rows]))
+
+
+def _cross(piece, stars, fields):
+    """Return Cov(c, v_i), shape (m, p, n)."""
+    rows = list(piece.family.rows)
+    own = np.einsum('rmn,rpn->mpn', fields * piece.weights,
+                    gram(stars.factor)[rows])
+    return own + np.einsum('mq,pnq->mpn', piece.sums.frames,
+                           _frame_part(stars, piece.factor))
+
+
+def _spread(piece):
+    """Return this part's share of Cov(c, c)."""
+    stars = eliminate(piece.problem)
+    fields = piece.family.fields(stars.basis)
+    cross = _cross(piece, stars, fields)[:, list(piece.family.rows)]
+    return np.einsum('mrn,rkn->mk', cross, fields * piece.weights)
+
+
+def _move(piece):
+    """Return values and covariances of a part with the mean field gone."""
+    stars = eliminate(piece.problem)
+    rows, fields = list(piece.family.rows), piece.family.fields(stars.basis)
+    values = piece.values.copy()
+    shift = piece.inverse @ piece.sums.moment
+    values[rows] -= np.einsum('rmn,m->rn', fields, shift)
+    scaled = np.einsum('rmn,mk->rkn', fields, piece.inverse)
+    half = np.einsum('rkn,kpn->rpn', scaled, _cross(piece, stars, fields))
+    covariance = piece.covariance.copy()
+    covariance[rows] -= half
+    covariance[:, rows] -= half.swapaxes(0, 1)
+    covariance[np.ix_(rows, rows)] += np.einsum(
+        'rkn,kj,sjn->rsn', scaled, piece.spread, scaled)
+    return values, covariance
+
+
+def remove_mean_field(problem, frames, estimates, family, weights, executor):
+    """Return estimates without the mean field, and the field q (m,)."""
+    def pieces(**others):
+        return _pieces(problem, frames, family, weights, estimates, **others)
+    results = run(executor, _accumulate, pieces())
+    sums = sum(results[1:], results[0])
+    inverse = np.linalg.pinv(sums.normal, hermitian=True)
+    spread = sum(run(executor, _spread, pieces(sums=sums)))
+    moved = run(executor, _move, pieces(sums=sums, inverse=inverse,
+                                        spread=spread))
+    values, covariance = (np.concatenate(some, axis=-1)
+                          for some in zip(*moved, strict=True))
+    return (replace(estimates, values=values, covariance=covariance),
+            inverse @ sums.moment)
+
+
+def mean_weights(values, covariance, rows, usable):
+    """
+    Return the weights (n,) of the stars in the mean field.
+
+    Inverse variances, the scatter of the true motions included; stars far
+    from the others (5 times their scatter) take no part.
+    """
+    middle = np.nanmedian(values[rows][:, usable], axis=1)[:, None]
+    away = values[rows] - middle
+    scatter = 1.4826 * np.nanmedian(np.abs(away[:, usable]))
+    variance = np.mean([covariance[k, k] for k in rows], axis=0)
+    distance = np.abs(away).max(axis=0)
+    near = usable & (distance <= 5 * np.sqrt(scatter**2 + variance))
+    weights = 1 / (variance + scatter**2)
+    return np.where(near & np.isfinite(weights), weights, 0.0)

@@ -1,0 +1,299 @@
+"""
+One stamp and the search for its mixture, in the units of the kernels.
+
+`Stamp` holds scaled pixels, `run` is one Levenberg-Marquardt fit, `search`
+finds where to start it, and the rest turns shape numbers into mixtures and
+back.
+"""
+from typing import NamedTuple
+
+import numpy as np
+
+from photutils_mgauss import _kernels
+from photutils_mgauss.mixture import GaussianMixture
+
+_TOLERANCE = 1e-8
+_MAX_STEPS = 500
+# A Gaussian narrower than this in stamp pixels falls between the pixel
+# centres and can take any flux.
+_MIN_STDDEV = 0.4
+# How firmly the total flux is tied and limits are kept, in units of the
+# power of the image.
+_TIE = 1e6
+_STIFFNESS = 1.0
+# The steps every split gets, and how many of the best go on.
+_TRIAL_STEPS = 8
+_FINALISTS = 2
+
+
+class Problem(NamedTuple):
+    """What is asked of every image of a stack."""
+
+    n_components: int
+    oversampling: tuple
+    origin: np.ndarray
+    radius: float | None
+    enclosed_flux: float | None
+    tied: bool
+    signed: bool
+    fixed: bool
+    has_error: bool
+
+    @property
+    def pitch(self):
+        """Image pixels per native pixel along (x, y)."""
+        return np.array(self.oversampling[::-1], float)
+
+    @property
+    def n_parameters(self):
+        per_gaussian = 4 if self.fixed else 6
+        return self.n_components * per_gaussian - self.tied
+
+
+class Workspace:
+    """
+    The memory in which kernels fit K Gaussians to stamps of one shape.
+
+    Parameters
+    ----------
+    n_components : int
+        The number K of Gaussians.
+    shape : (ny, nx) tuple of int
+        The shape of the stamps.
+    """
+
+    def __init__(self, n_components, shape):
+        k, n = n_components, 6 * n_components
+        self.scratch = (
+            np.empty((k, *shape)), np.empty(shape), np.empty((k, k)),
+            np.empty(k), np.empty((k, k + 1)), np.empty(k, bool),
+            np.empty((k, 6, 6)), np.empty((5, shape[1])), np.empty((5, 5)),
+            np.empty((6, 6)), np.empty((6, 6)))
+        self.matrices = np.empty((n, n)), np.empty((n, n))
+        self.vectors = (np.empty(n), np.empty(n), np.empty((k, 5)),
+                        np.empty(k))
+
+
+class Stamp(NamedTuple):
+    """
+    One image, scaled for the kernels.
+
+    ``pixels`` have a peak of 1 and ``weight`` makes their power 1: pixel
+    unit ``scale`` and weight unit ``weight_unit``. Means are relative to
+    ``centre``; ``tie`` and ``limits`` are the kernels'.
+    """
+
+    pixels: np.ndarray
+    weight: np.ndarray
+    centre: np.ndarray
+    peak: np.ndarray
+    tie: tuple
+    limits: np.ndarray
+    scale: float
+    weight_unit: float
+
+    @classmethod
+    def prepare(cls, image, weight, peak, problem):
+        used = weight > 0
+        pixels = np.where(used, image, 0.0)
+        scale = pixels.max()
+        pixels /= scale
+        weight_unit = (weight * pixels**2).sum()
+        centre = problem.origin if problem.fixed else np.rint(peak)
+        total = pixels.sum()
+        tie = (total, _TIE / total**2) if problem.tied else (0.0, 0.0)
+        reach = _reach(used, centre)
+        limits = np.array([np.log(_MIN_STDDEV), np.log(reach.max()), *reach,
+                           _STIFFNESS])
+        return cls(pixels, weight / weight_unit, centre, peak, tie, limits,
+                   scale, weight_unit)
+
+
+def _reach(used, centre):
+    """Return how far used pixels are from the centre along x and y."""
+    j, i = np.nonzero(used)
+    return np.array([np.abs(i - centre[0]).max() + 1,
+                     np.abs(j - centre[1]).max() + 1])
+
+
+class Solution(NamedTuple):
+    """The kernels' answer, in stamp pixels."""
+
+    shapes: np.ndarray
+    fluxes: np.ndarray
+    cost: float
+    stopped: bool
+
+
+def run(stamp, problem, spaces, shapes, max_steps=_MAX_STEPS):
+    """Return what Levenberg-Marquardt makes of a start (K, 5)."""
+    shapes = shapes.copy()
+    fluxes = np.empty(len(shapes))
+    space = spaces[len(shapes)]
+    cost, status, _ = _kernels.fit_shapes(
+        stamp.pixels, stamp.weight, stamp.centre, shapes, fluxes, stamp.tie,
+        problem.signed, problem.fixed, stamp.limits, _TOLERANCE, max_steps,
+        space.scratch, space.matrices, space.vectors)
+    return Solution(shapes, fluxes, cost, status == _kernels.FIT_STOPPED)
+
+
+def search(stamp, problem, spaces):
+    """
+    Return the best mixture of K Gaussians that starts of its own lead to.
+
+    One Gaussian is fitted alone; then, one at a time, another is added by
+    every way of `_splits`, each is improved for a few steps, and the best is
+    fitted. Of K geometric starts at once, one in three or fewer finds the
+    minimum; this way nearly all do.
+    """
+    best = run(stamp, problem, spaces, _core(stamp, problem))
+    for k in range(2, problem.n_components + 1):
+        trials = [run(stamp, problem, spaces, start, _TRIAL_STEPS)
+                  for start in _splits(best.shapes, problem)]
+        trials.sort(key=lambda trial: trial.cost)
+        n_best = _FINALISTS if k == problem.n_components else 1
+        best = min((run(stamp, problem, spaces, trial.shapes)
+                    for trial in trials[:n_best]),
+                   key=lambda solution: solution.cost)
+    return best
+
+
+def _core(stamp, problem):
+    """Return a round Gaussian with the peak's position and half-width."""
+    above = np.count_nonzero(stamp.pixels > 0.5)
+    stddev = max(np.sqrt(above / np.pi / (2 * np.log(2))), _MIN_STDDEV)
+    mean = np.zeros(2) if problem.fixed else stamp.peak - stamp.centre
+    return np.array([[*mean, -np.log(stddev), 0, -np.log(stddev)]])
+
+
+def _splits(shapes, problem):
+    """
+    Yield starts (K + 1, 5) with one Gaussian more than shapes (K, 5).
+
+    Each Gaussian in turn is split in width, along x, along y, and into two of
+    different elongation; the last start adds a Gaussian wider than all.
+    """
+    for k, parent in enumerate(shapes):
+        rest = np.delete(shapes, k, axis=0)
+        for one, other in _children(parent, problem):
+            yield np.vstack([rest, one, other])
+    widest = shapes[np.argmin(shapes[:, 2] + shapes[:, 4])]
+    yield np.vstack([shapes, _scaled(widest, 2.5)])
+
+
+def _children(parent, problem):
+    yield _scaled(parent, 1 / 1.5), _scaled(parent, 1.5)
+    if problem.signed:  # a hole in a Gaussian narrower than the parent
+        yield _scaled(parent, 0.5), _scaled(parent, 0.8)
+    if not problem.fixed:
+        for offset in ((0.6, 0.0), (0.0, 0.6)):
+            yield _shifted(parent, 1, offset), _shifted(parent, -1, offset)
+    stretch = np.array([0, 0, 0.4, 0, -0.4])
+    yield parent + stretch, parent - stretch
+    shear = np.array([0, 0, 0, 0.5 * np.exp(parent[4]), 0])
+    yield parent + shear, parent - shear
+
+
+def _scaled(shape, factor):
+    """Return the Gaussian with its widths times a factor."""
+    x, y, log_l, t, log_m = shape
+    shift = np.log(factor)
+    return np.array([x, y, log_l - shift, t / factor, log_m - shift])
+
+
+def _shifted(shape, sign, offset):
+    """Return it moved by an offset in the frame where it is a circle."""
+    x, y, log_l, t, log_m = shape
+    dy = sign * offset[1] / np.exp(log_m)
+    dx = (sign * offset[0] - t * dy) / np.exp(log_l)
+    return np.array([x + dx, y + dy, log_l, t, log_m])
+
+
+# Between shapes and mixtures.
+
+def shapes_of(mixture, problem, centre):
+    """Return the shapes (K, 5) of a mixture in stamp pixels."""
+    pitch = problem.pitch
+    means = mixture.means * pitch + problem.origin - centre
+    if problem.fixed:
+        means = np.zeros_like(means)
+    covariances = mixture.covariances * pitch * pitch[:, None]
+    sxx, sxy, syy = (covariances[:, 0, 0], covariances[:, 0, 1],
+                     covariances[:, 1, 1])
+    length = np.sqrt(syy / (sxx * syy - sxy**2))
+    return np.column_stack([means, np.log(length), -length * sxy / syy,
+                            -0.5 * np.log(syy)])
+
+
+def narrow_first(solution):
+    """Return the solution with narrow Gaussians first."""
+    order = np.argsort(-solution.shapes[:, 2] - solution.shapes[:, 4],
+                       kind='stable')
+    return solution._replace(shapes=solution.shapes[order],
+                             fluxes=solution.fluxes[order])
+
+
+def mixture_of(solution, problem, centre):
+    pitch = problem.pitch
+    x, y, log_l, t, log_m = solution.shapes.T
+    length, m = np.exp(log_l), np.exp(log_m)
+    norm = np.hypot(t, m)
+    stddevs = np.column_stack([norm / (length * m), 1 / m]) / pitch
+    means = (np.column_stack([x, y]) + centre - problem.origin) / pitch
+    fluxes = solution.fluxes
+    return GaussianMixture.from_stddevs(fluxes / fluxes.sum(), means, stddevs,
+                                        -t / norm)
+
+
+def covariance_of(problem, stamp, solution, space):
+    """
+    Return the covariance (6K, 6K) of the parameters users see.
+
+    It is the inverse of the normal matrix, for the Gaussians that have flux
+    and the parameters that are free.
+    """
+    n = problem.n_components
+    matrix, gradient = np.empty((6 * n, 6 * n)), np.empty(6 * n)
+    _kernels.project(stamp.pixels, stamp.weight, stamp.centre,
+                     solution.shapes, stamp.tie, problem.signed,
+                     solution.fluxes.copy(), space.scratch)
+    _kernels.normal_equations(
+        stamp.weight, stamp.centre, solution.shapes, solution.fluxes,
+        stamp.tie, space.scratch, matrix, gradient)
+    _kernels.add_penalties(solution.shapes, stamp.limits, matrix, gradient)
+    # From fluxes first to Gaussian by Gaussian.
+    place = np.column_stack([np.arange(n),
+                             np.arange(n, 6 * n).reshape(n, 5)]).ravel()
+    free = np.repeat(solution.fluxes != 0, 6)
+    if problem.fixed:
+        free &= np.tile([True, False, False, True, True, True], n)
+    chosen = np.ix_(place[free], place[free])
+    slopes = _slopes(solution, problem, stamp)[:, free]
+    inverse = np.linalg.pinv(matrix[chosen], rcond=1e-15, hermitian=True)
+    covariance = slopes @ inverse @ slopes.T
+    covariance /= stamp.weight_unit * stamp.scale**2
+    unknown = np.repeat(solution.fluxes == 0, 6)
+    covariance[unknown] = covariance[:, unknown] = np.nan
+    return covariance
+
+
+def _slopes(solution, problem, stamp):
+    """Return d(what users see) / d(what is fitted), (6K, 6K)."""
+    pitch = problem.pitch
+    _, _, log_l, t, log_m = solution.shapes.T
+    length, m = np.exp(log_l), np.exp(log_m)
+    square = t**2 + m**2
+    wide, high = np.sqrt(square) / (length * m) / pitch[0], 1 / m / pitch[1]
+    n = len(t)
+    blocks = np.zeros((n, 6, 6))
+    blocks[:, 0, 0] = stamp.scale / pitch.prod()
+    blocks[:, [1, 2], [1, 2]] = 1 / pitch
+    blocks[:, 3, 3] = -wide
+    blocks[:, 3, 4] = wide * t / square
+    blocks[:, 3, 5] = -wide * t**2 / square
+    blocks[:, 4, 5] = -high
+    blocks[:, 5, 4] = -(m**2) / square**1.5
+    blocks[:, 5, 5] = t * m**2 / square**1.5
+    slopes = np.zeros((n, 6, n, 6))
+    slopes[np.arange(n), :, np.arange(n)] = blocks
+    return slopes.reshape(6 * n, 6 * n)

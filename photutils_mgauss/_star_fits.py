@@ -1,0 +1,290 @@
+"""
+Many stars fitted at once: arrays in, arrays out.
+
+Flux, x and y of every star, alone or jointly with the others of its group,
+by Levenberg-Marquardt in compiled code; what photutils adds around that
+(tables, units, flags) is not here.
+"""
+import itertools
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from photutils_mgauss import _kernels
+from photutils_mgauss.gridded import GriddedMixturePSF
+from photutils_mgauss.model import MultiGaussianPSFModel
+
+CONVERGED = (_kernels._CONVERGED, _kernels._STALLED)
+BAD_ERROR = _kernels._BAD_ERROR
+
+# Stars (of groups: boxes times stars) handed to a thread at a time: a tenth
+# of a second, so that an interrupt is soon seen.
+_CHUNK = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """
+    The pixels of an image, as the kernels take them.
+
+    Attributes
+    ----------
+    data : (ny, nx) `~numpy.ndarray`
+        The image, float64.
+    error : (ny, nx) or (0, 0) `~numpy.ndarray`
+        The standard deviations; none if empty.
+    mask : (ny, nx) or (0, 0) `~numpy.ndarray`
+        Which pixels are left out; none if empty.
+    gain : float
+        If not 0, the variance of a pixel is the square of its error plus its
+        stars' light over this.
+    """
+
+    data: np.ndarray
+    error: np.ndarray
+    mask: np.ndarray
+    gain: float = 0.0
+
+    @classmethod
+    def from_arrays(cls, data, error=None, mask=None, gain=None):
+        """Convert to native float64; what is not finite is masked."""
+        data = _as_kernels_take(data, np.float64)
+        mask = _as_kernels_take(_full_mask(data, mask), np.bool_)
+        error = _as_kernels_take(
+            np.empty((0, 0)) if error is None else error, np.float64)
+        return cls(data, error, mask, 0.0 if gain is None else float(gain))
+
+
+def _as_kernels_take(array, dtype):
+    """Return the array in the one form for which kernels are compiled."""
+    return np.require(array, dtype, ['C', 'A', 'W'])
+
+
+def _full_mask(data, mask):
+    """Return the mask joined with the non-finite pixels, or an empty one."""
+    finite = np.isfinite(data)
+    if mask is not None:
+        return ~finite | np.asarray(mask, dtype=bool)
+    return np.empty((0, 0), bool) if finite.all() else ~finite
+
+
+def psf_arrays(model):
+    """
+    Return the kernels' form of a PSF model.
+
+    Returns
+    -------
+    nodes, paces, x_grid, y_grid, integrated : tuple
+        The mixtures at the nodes (M, K, 6), what the kernels precompute of
+        them (M, K, 4), the axes of the grid, and whether they are integrated
+        over pixels.
+    """
+    if isinstance(model, GriddedMixturePSF):
+        grid = model._grid
+        rows, x_grid, y_grid = grid.rows, grid.x_grid, grid.y_grid
+    else:
+        rows = model.mixture.rows[None]
+        x_grid = y_grid = np.zeros(1)
+    rows, x_grid, y_grid = (_as_kernels_take(a, np.float64)
+                            for a in (rows, x_grid, y_grid))
+    paces = np.empty((*rows.shape[:2], 4))
+    _kernels.paces(rows, paces)
+    return rows, paces, x_grid, y_grid, model.pixel_integrated
+
+
+def is_fixed_shape(model):
+    """Return whether the kernels can fit all that is free in a model."""
+    if not isinstance(model, (GriddedMixturePSF, MultiGaussianPSFModel)):
+        return False
+    return all(getattr(model, name).fixed for name in model.param_names[3:])
+
+
+def cut_boxes(x, y, fit_shape, data_shape):
+    """
+    Return the boxes of ``fit_shape`` around stars, trimmed to the image.
+
+    Parameters
+    ----------
+    x, y : (n,) `~numpy.ndarray`
+        Finite positions.
+    fit_shape, data_shape : (ny, nx) tuple
+
+    Returns
+    -------
+    (n, 4) `~numpy.ndarray` of int
+        First row, first column, height and width; heights and widths are 0
+        where a box does not overlap the image.
+    """
+    boxes = np.empty((x.size, 4), np.int64)
+    for axis, position in enumerate((y, x)):
+        # As astropy.nddata.overlap_slices rounds.
+        start = np.ceil(position - fit_shape[axis] / 2)
+        stop = np.clip(start + fit_shape[axis], 0, data_shape[axis])
+        start = np.clip(start, 0, data_shape[axis])
+        boxes[:, axis] = start
+        boxes[:, 2 + axis] = stop - start
+    return boxes
+
+
+def count_pixels(image, boxes):
+    """Return how many pixels of each box are not masked, (n,)."""
+    if image.mask.size == 0:
+        return boxes[:, 2] * boxes[:, 3]
+    out = np.empty(len(boxes), np.int64)
+    _kernels.count_pixels(image.mask, boxes, out)
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Stars:
+    """
+    What is to be fitted: n stars, those of a group next to each other.
+
+    Attributes
+    ----------
+    initial, lower, upper : (n, 3) `~numpy.ndarray`
+        Flux, x and y to start from, and their bounds.
+    boxes : (n, 4) `~numpy.ndarray` of int
+        The pixels of each, see `cut_boxes`.
+    sky : (n,) `~numpy.ndarray`
+        The background to subtract.
+    starts : (g + 1,) `~numpy.ndarray` of int
+        Where each group starts.
+    fixed : (3,) `~numpy.ndarray` of bool
+        Which of flux, x and y are not fitted.
+    """
+
+    initial: np.ndarray
+    boxes: np.ndarray
+    sky: np.ndarray
+    starts: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    fixed: np.ndarray
+
+    def chunks(self):
+        """Yield runs of whole groups of about equal cost."""
+        sizes = np.diff(self.starts)
+        cost = np.cumsum(sizes.astype(float) ** 2)
+        if cost.size == 0:
+            return
+        ends = np.searchsorted(cost, np.arange(_CHUNK, cost[-1], _CHUNK))
+        edges = np.unique(np.concatenate([[0], ends + 1, [sizes.size]]))
+        edges = edges[edges <= sizes.size]
+        for first, last in itertools.pairwise(edges):
+            yield self._part(first, last)
+
+    def _part(self, first, last):
+        starts = self.starts[first:last + 1]
+        rows = slice(starts[0], starts[-1])
+        return Stars(self.initial[rows], self.boxes[rows], self.sky[rows],
+                     starts - starts[0], self.lower[rows], self.upper[rows],
+                     self.fixed)
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """
+    What came out, star by star.
+
+    Attributes
+    ----------
+    values : (n, 3) `~numpy.ndarray`
+        Flux, x and y.
+    covariances : (n, 3, 3) `~numpy.ndarray`
+        Their covariances, NaN for what was fixed.
+    sky : (n, 2) `~numpy.ndarray`
+        The fitted level of the sky and its error, NaN if it was not fitted.
+    sums : (n, 3) `~numpy.ndarray`
+        Sum of absolute residuals, residual of the central pixel, chi2.
+    outcome : (n, 2) `~numpy.ndarray` of int
+        The status, 1 to 4 for success, and the number of evaluations.
+    """
+
+    values: np.ndarray
+    covariances: np.ndarray
+    sky: np.ndarray
+    sums: np.ndarray
+    outcome: np.ndarray = field(repr=False)
+
+    @classmethod
+    def empty(cls, n):
+        """Return results of n stars not fitted yet."""
+        return cls(np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan),
+                   np.full((n, 2), np.nan), np.full((n, 3), np.nan),
+                   np.zeros((n, 2), np.int64))
+
+    @property
+    def arrays(self):
+        return (self.values, self.sky, self.covariances, self.sums,
+                self.outcome)
+
+    @classmethod
+    def joined(cls, parts):
+        """Return the results of all chunks, in order."""
+        if not parts:
+            return cls.empty(0)
+        values, sky, covariances, sums, outcome = (
+            np.concatenate(arrays) for arrays in zip(
+                *(part.arrays for part in parts), strict=True))
+        return cls(values, covariances, sky, sums, outcome)
+
+
+def _fit_chunk(image, psf, fit_sky, max_iterations, stars):
+    fits = Fits.empty(len(stars.initial))
+    _kernels.fit_stars(
+        image.data, image.error, image.mask, stars.starts, stars.boxes,
+        stars.initial, stars.sky, stars.lower, stars.upper, stars.fixed,
+        bool(fit_sky), image.gain, psf, max_iterations, *fits.arrays)
+    return fits
+
+
+def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
+              executor=None):
+    """
+    Fit all stars.
+
+    Parameters
+    ----------
+    image : Image
+    psf : tuple
+        See `psf_arrays`.
+    stars : Stars
+    fit_sky : bool, optional
+        Whether to fit a level of the sky to each group, too.
+    max_iterations : int, optional
+    executor : `~concurrent.futures.Executor`, optional
+        Where the chunks are fitted; by default in a pool of threads.
+
+    Returns
+    -------
+    Fits
+    """
+    work = partial(_fit_chunk, image, psf, fit_sky, max_iterations)
+    chunks = list(stars.chunks())
+    if executor is not None:
+        return Fits.joined(_map_cancelling(executor, work, chunks))
+    n_threads = min(len(chunks), available_cores())
+    if n_threads < 2:
+        return Fits.joined([work(chunk) for chunk in chunks])
+    with ThreadPoolExecutor(n_threads) as pool:
+        return Fits.joined(_map_cancelling(pool, work, chunks))
+
+
+def available_cores():
+    """Return on how many cores this process may run."""
+    return (len(os.sched_getaffinity(0))
+            if hasattr(os, 'sched_getaffinity') else os.cpu_count() or 1)
+
+
+def _map_cancelling(executor, function, arguments):
+    """Map like an executor, but let nothing start after an exception."""
+    futures = [executor.submit(function, argument) for argument in arguments]
+    try:
+        return [future.result() for future in futures]
+    finally:
+        for future in futures:
+            future.cancel()

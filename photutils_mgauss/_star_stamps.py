@@ -1,0 +1,150 @@
+"""Stamps of stars cut from an image, and the noise model of their pixels."""
+from dataclasses import dataclass
+
+import numpy as np
+
+# A stamp is used if its middle 3x3 pixels and this share of the rest are.
+_MIN_GOOD = 0.5
+
+
+@dataclass
+class Stamps:
+    """
+    The pixels around n stars.
+
+    Attributes
+    ----------
+    data : (n, s, s) `~numpy.ndarray`
+        The pixels; 0 where there are none.
+    base : (n, s, s) `~numpy.ndarray`
+        Their variance without the star's own photons.
+    good : (n, s, s) `~numpy.ndarray` of bool
+        Which pixels are inside the circle and can be used.
+    corners : (n, 2) `~numpy.ndarray`
+        The pixel (x, y) of each stamp's first.
+    slope : float
+        Variance for each unit of light of a star (one over the gain).
+    """
+
+    data: np.ndarray
+    base: np.ndarray
+    good: np.ndarray
+    corners: np.ndarray
+    slope: float
+
+    @property
+    def radius(self):
+        """Half the width of a stamp, in whole pixels."""
+        return self.data.shape[1] // 2
+
+    def offsets(self):
+        """Return the distance of each pixel from the middle one, (s, s)."""
+        steps = np.arange(-self.radius, self.radius + 1)
+        return np.hypot(steps, steps[:, None])
+
+    def usable(self):
+        """Return which stamps have enough pixels, the middle ones of all."""
+        middle = slice(self.radius - 1, self.radius + 2)
+        core = self.good[:, middle, middle].all(axis=(1, 2))
+        full = np.count_nonzero(self.offsets() <= self.radius + 0.5)
+        return core & (self.good.sum(axis=(1, 2)) >= _MIN_GOOD * full)
+
+
+def cut_stamps(data, error, mask, x, y, radius):
+    """
+    Cut stamps of n stars out of an image.
+
+    Without ``error`` the variance is 1.
+    """
+    half = int(np.ceil(radius))
+    # A star without a position is far from the image, too.
+    positions = np.nan_to_num(np.column_stack([x, y]), nan=-1e6)
+    corners = np.rint(np.clip(positions, -1e6, 1e6)) - half
+    size = 2 * half + 1
+    shape = (len(corners), size, size)
+    stamps, variance = np.zeros(shape), np.ones(shape)
+    good = np.zeros(shape, bool)
+    for i, corner in enumerate(corners.astype(int)):
+        here, there = _overlap(corner, size, data.shape)
+        stamps[i][here] = data[there]
+        good[i][here] = True if mask is None else ~mask[there]
+        if error is not None:
+            # The sign is kept: a negative error marks a bad pixel, too.
+            sigma = error[there].astype(float)
+            variance[i][here] = sigma * np.abs(sigma)
+    good &= np.isfinite(stamps) & np.isfinite(variance) & (variance > 0)
+    stamps[~good] = 0
+    variance[~good] = 1
+    new = Stamps(stamps, variance, good, corners, 0.0)
+    new.good &= new.offsets() <= radius + 0.5
+    return new
+
+
+def _overlap(corner, size, shape):
+    """Return the slices of a stamp and of an image where they overlap."""
+    low = np.clip(corner, 0, shape[::-1])
+    high = np.clip(corner + size, 0, shape[::-1])
+    high = np.maximum(low, high)
+    there = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1],
+                                              strict=True))
+    here = tuple(slice(a, b) for a, b in zip((low - corner)[::-1],
+                                             (high - corner)[::-1],
+                                             strict=True))
+    return here, there
+
+
+def remove_star_noise(stamps, gain):
+    """
+    Take the photons of the stars out of the variance, in place.
+
+    The error of a pixel is often made from the pixel itself. A fit with such
+    weights believes low pixels more than high ones and finds less flux than
+    there is. The fit therefore needs the variance without the star, and adds
+    that of the model's light.
+
+    Parameters
+    ----------
+    stamps : Stamps
+        With the whole variance in ``base``.
+    gain : float or None
+        Electrons per unit of data; infinity to leave the variance as it is;
+        None to find out whether it was made from the data, and with what
+        gain.
+    """
+    slope, clipped = _poisson_slope(stamps) if gain is None else (1 / gain,
+                                                                  True)
+    if slope == 0:
+        return
+    light = np.maximum(stamps.data, 0) if clipped else stamps.data
+    rest = stamps.base - slope * light
+    # What is left is sky and read-out noise; no pixel has much less of it
+    # than the others.
+    floor = max(0.1 * np.median(rest[stamps.good]),
+                1e-3 * np.median(stamps.base[stamps.good]))
+    stamps.base = np.where(stamps.good, np.maximum(rest, floor), 1.0)
+    stamps.slope = slope
+
+
+def _poisson_slope(stamps):
+    """
+    Return how the variance grows with the data, and if it is clipped at 0.
+
+    The slope is 0 unless the variance was computed from these very pixels:
+    an expected variance scatters about any line in the data by their noise.
+    Differences of neighbouring pixels keep gradients of the sky out of this.
+    """
+    pairs = stamps.good[:, :, 1:] & stamps.good[:, :, :-1]
+    change = np.diff(stamps.base, axis=2)[pairs]
+    noise = np.sqrt(np.median(stamps.base[stamps.good]))
+    best, scatter = (0.0, True), 0.3
+    for clipped in (True, False):
+        light = np.maximum(stamps.data, 0) if clipped else stamps.data
+        step = np.diff(light, axis=2)[pairs]
+        power = step @ step
+        slope = step @ change / power if power > 0 else 0.0
+        if slope <= 0:
+            continue
+        rest = np.median(np.abs(change - slope * step)) / (slope * noise)
+        if rest < scatter:
+            best, scatter = (slope, clipped), rest
+    return best

@@ -1,0 +1,57 @@
+"""Images and source tables as the user hands them over."""
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.table import Table
+
+_X_NAMES = ('x', 'x_fit', 'x_init', 'x_centroid', 'xcentroid', 'x_0')
+_FLUX_NAMES = ('flux', 'flux_fit', 'flux_init', 'flux_0')
+
+
+@dataclass(frozen=True, eq=False)
+class Sources:
+    """x, y, flux (NaN if unknown) of all sources, and which are stars."""
+
+    x: np.ndarray
+    y: np.ndarray
+    flux: np.ndarray
+    selected: np.ndarray
+
+
+def as_image(value, name, shape=None):
+    """Return an image without copying it: it may be large."""
+    value = np.asanyarray(value)
+    if value.dtype.kind not in 'buif':
+        msg = f'{name} must be an array of numbers, got {value.dtype}'
+        raise TypeError(msg)
+    if value.ndim != 2 or (shape is not None and value.shape != shape):
+        want = '(ny, nx)' if shape is None else f'that of data, {shape}'
+        msg = f'{name} must have the shape {want}, got {value.shape}'
+        raise ValueError(msg)
+    return np.asarray(value)
+
+
+def read_sources(stars):
+    if not isinstance(stars, Table):
+        msg = f'stars must be an astropy Table, got {type(stars).__name__}'
+        raise TypeError(msg)
+    name = next((n for n in _X_NAMES if n in stars.colnames), None)
+    if name is None:
+        msg = f'stars must have a column x, got {stars.colnames}'
+        raise ValueError(msg)
+    x, y = _column(stars, name), _column(stars, 'y' + name.removeprefix('x'))
+    flux = next((n for n in _FLUX_NAMES if n in stars.colnames), None)
+    flux = np.full(x.size, np.nan) if flux is None else _column(stars, flux)
+    selected = np.ones(x.size, bool)
+    if 'selected' in stars.colnames:
+        selected = np.asarray(stars['selected'], bool)
+    return Sources(x, y, flux, selected)
+
+
+def _column(table, name):
+    if name not in table.colnames:
+        msg = f'stars must have a column {name}, got {table.colnames}'
+        raise ValueError(msg)
+    column = table[name]
+    column = getattr(column, 'value', column)
+    return np.ma.filled(np.ma.asarray(column, float), np.nan)

@@ -1,0 +1,280 @@
+r"""
+A fitter with analytic derivatives, for photutils' and astropy's interfaces.
+
+Levenberg-Marquardt on the normal equations: with weighted residuals r and
+Jacobian J each step solves
+
+.. math::
+
+    (J^T J + \lambda\, \mathrm{diag}\, J^T J)\, \delta = J^T r .
+
+Photutils fits groups of stars without derivatives; here each star of a group
+contributes those of its own PSF.
+"""
+import numpy as np
+
+from photutils_mgauss import _compat
+from photutils_mgauss._psf_model import PSFModel
+
+__all__ = ['MixtureFitter']
+
+_MESSAGES = {
+    0: 'The fit stopped at its largest number of iterations.',
+    2: 'No step makes the sum of squares smaller.',
+    3: 'The next step is expected to be below the tolerance.',
+}
+
+# Of the expected next step, see _length.
+_TOLERANCE = 1e-6
+
+# The step of numerical derivatives, for models without analytic ones.
+_EPSILON = np.sqrt(np.finfo(float).eps)
+
+
+class MixtureFitter:
+    """
+    Levenberg-Marquardt with analytic derivatives, for single stars and groups.
+
+    Pass it as ``fitter`` to `photutils.psf.PSFPhotometry` or
+    `photutils.psf.IterativePSFPhotometry`, or use it as any astropy fitter of
+    two-dimensional models. Bounds and fixed parameters are respected; tied
+    parameters are not supported.
+
+    Attributes
+    ----------
+    fit_info : dict
+        Of the last fit: ``param_cov`` (covariance of the free parameters, or
+        None), ``fun`` (weighted model minus data), ``status`` (1 to 4 for
+        success), ``message`` and ``nfev``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from photutils_mgauss import (GaussianMixture, MixtureFitter,
+    ...                               MultiGaussianPSFModel)
+    >>> mixture = GaussianMixture([1], [[0, 0]], [[[1, 0], [0, 1]]])
+    >>> y, x = np.mgrid[:11, :11]
+    >>> model = MultiGaussianPSFModel(mixture, flux=90, x_0=5, y_0=5)
+    >>> data = mixture.render(11, 5.2, 4.9, flux=100)
+    >>> fitted = MixtureFitter()(model, x, y, data)
+    >>> [round(float(p), 6) for p in fitted.parameters[:3]]
+    [100.0, 5.2, 4.9]
+    """
+
+    supported_constraints = ('fixed', 'bounds')
+
+    def __init__(self):
+        self.fit_info = {}
+
+    def __repr__(self):
+        return '<MixtureFitter()>'
+
+    def __call__(self, model, x, y, z, weights=None, *, maxiter=100,
+                 inplace=False):
+        """
+        Fit a model to the pixels.
+
+        Parameters
+        ----------
+        model : `~astropy.modeling.Fittable2DModel`
+            The model to start from.
+        x, y : array_like
+            The positions of the pixels.
+        z : array_like
+            Their values.
+        weights : array_like, optional
+            One over their standard deviations. Without, the covariance is
+            scaled by the scatter of the residuals.
+        maxiter : int, optional
+            The largest number of steps.
+        inplace : bool, optional
+            Whether to change ``model`` itself.
+
+        Returns
+        -------
+        `~astropy.modeling.Fittable2DModel`
+            The model with the fitted parameters.
+
+        Raises
+        ------
+        ValueError
+            If nothing is free, a parameter is tied, or the arrays differ in
+            size or hold values that are not finite.
+        """
+        problem = _Problem(model, x, y, z, weights)
+        state, status, n_steps = _minimize(problem, maxiter)
+        self.fit_info = {
+            'param_cov': problem.covariance(state), 'fun': state.residuals,
+            'status': status, 'message': _MESSAGES[status], 'nfev': n_steps}
+        fitted = model if inplace else model.copy()
+        fitted.parameters = problem.full(state.values)
+        return fitted
+
+
+class _State:
+    """Parameter values and what a step from them needs."""
+
+    def __init__(self, values, residuals, jacobian):
+        self.values = values
+        self.residuals = residuals
+        self.chi2 = residuals @ residuals
+        self.matrix = jacobian @ jacobian.T
+        self.gradient = -(jacobian @ residuals)
+
+    @property
+    def scale(self):
+        """The square roots of the matrix's diagonal, 1 where it is zero."""
+        scale = np.sqrt(np.diag(self.matrix))
+        return np.where(scale > 0, scale, 1)
+
+
+class _Problem:
+    """Weighted residuals and Jacobian as functions of the free parameters."""
+
+    def __init__(self, model, x, y, z, weights):
+        self.base, self.n_sources = _compat.group_members(model)
+        self.x, self.y, self.z = (np.ravel(a).astype(float)
+                                  for a in (x, y, z))
+        self.weights = None if weights is None else np.ravel(weights)
+        self.start = np.array(model.parameters, dtype=float)
+        names = model.param_names
+        self.free = np.array([not model.fixed[name] for name in names])
+        bounds = [model.bounds[name] for name in names]
+        self.lower = np.array([-np.inf if low is None else low
+                               for low, _ in bounds])[self.free]
+        self.upper = np.array([np.inf if high is None else high
+                               for _, high in bounds])[self.free]
+        self._check(model)
+
+    def _check(self, model):
+        tied = [name for name, tie in model.tied.items() if tie]
+        if tied:
+            msg = f'model must not have tied parameters, got {tied}'
+            raise ValueError(msg)
+        if not self.free.any():
+            msg = 'model must have a free parameter, got none'
+            raise ValueError(msg)
+        sizes = {a.size for a in (self.x, self.y, self.z, self.weights)
+                 if a is not None}
+        if len(sizes) > 1:
+            msg = f'x, y, z and weights must have one size, got {sizes}'
+            raise ValueError(msg)
+        if not np.isfinite(self.z).all() or (
+                self.weights is not None
+                and not np.isfinite(self.weights).all()):
+            msg = 'z and weights must be finite'
+            raise ValueError(msg)
+
+    def full(self, values):
+        """Return all parameters, given the free ones."""
+        parameters = self.start.copy()
+        parameters[self.free] = values
+        return parameters
+
+    def evaluate(self, values):
+        """Return the state at the values of the free parameters."""
+        parameters = self.full(values).reshape(self.n_sources, -1)
+        free = self.free.reshape(self.n_sources, -1)
+        total = np.zeros(self.z.size)
+        rows = []
+        for own, is_free in zip(parameters, free, strict=True):
+            value, derivatives = _derivatives(self.base, self.x, self.y, own,
+                                              is_free)
+            total += value
+            rows += derivatives
+        residuals, jacobian = total - self.z, np.array(rows)
+        if self.weights is not None:
+            residuals *= self.weights
+            jacobian *= self.weights
+        return _State(values, residuals, jacobian)
+
+    def covariance(self, state):
+        """Return the covariance of the free parameters, or None."""
+        dof = self.z.size - state.values.size
+        if dof <= 0 or not np.isfinite(state.matrix).all():
+            return None
+        scale = state.scale
+        scaled = state.matrix / np.outer(scale, scale)
+        inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
+        covariance = inverse / np.outer(scale, scale)
+        return covariance * (1 if self.weights is not None
+                             else state.chi2 / dof)
+
+
+def _derivatives(model, x, y, parameters, free):
+    """Return a model's values and its derivatives by what is free."""
+    if isinstance(model, PSFModel):
+        columns = model.fit_deriv(x, y, *parameters)
+        value = parameters[0] * columns[0] if not model.flux.fixed else (
+            model.evaluate(x, y, *parameters))
+    else:
+        value = model.evaluate(x, y, *parameters)
+        columns = (_numerical(model, x, y, parameters, value, free)
+                   if model.fit_deriv is None
+                   else model.fit_deriv(x, y, *parameters))
+    return value, [np.ravel(column) for column, is_free
+                   in zip(columns, free, strict=True) if is_free]
+
+
+def _numerical(model, x, y, parameters, value, free):
+    columns = []
+    for i, is_free in enumerate(free):
+        moved = parameters.copy()
+        step = _EPSILON * max(abs(parameters[i]), 1)
+        moved[i] += step
+        columns.append((model.evaluate(x, y, *moved) - value) / step
+                       if is_free else value)
+    return columns
+
+
+def _minimize(problem, max_steps):
+    """Return the best state, the status and the number of evaluations."""
+    values = np.clip(problem.start[problem.free], problem.lower,
+                     problem.upper)
+    state = problem.evaluate(values)
+    damping, last = 0.0, 1.0
+    for n in range(max_steps):
+        step = _bounded_step(problem, state, damping)
+        if step is None:
+            damping = max(10 * damping, 1e-6)
+            continue
+        length = _length(step, state)
+        new = problem.evaluate(state.values + step)
+        if not new.chi2 <= state.chi2 * (1 + 1e-12):
+            if length < 1e-3 * _TOLERANCE or damping > 1e12:
+                return state, 2, n + 2
+            damping, last = max(10 * damping, 1e-3), 1.0
+            continue
+        state = new
+        # Convergence is linear at the worst, see the next step's length.
+        if damping == 0 and length * min(1.0, length / last) < _TOLERANCE:
+            return state, 3, n + 2
+        last = length
+        damping = damping / 10 if damping > 1e-5 else 0.0
+    return state, 0, max_steps + 1
+
+
+def _bounded_step(problem, state, damping):
+    """Return a step that stays within bounds, or None if it is singular."""
+    low = (state.values <= problem.lower) & (state.gradient < 0)
+    high = (state.values >= problem.upper) & (state.gradient > 0)
+    moves = ~(low | high) & (np.diag(state.matrix) > 0)
+    step = np.zeros(state.values.size)
+    if moves.any():
+        scale = state.scale[moves]
+        matrix = state.matrix[np.ix_(moves, moves)] / np.outer(scale, scale)
+        matrix[np.diag_indices_from(matrix)] += damping
+        try:
+            factor = np.linalg.cholesky(matrix)
+        except np.linalg.LinAlgError:
+            return None
+        half = np.linalg.solve(factor, state.gradient[moves] / scale)
+        step[moves] = np.linalg.solve(factor.T, half) / scale
+    end = np.clip(state.values + step, problem.lower, problem.upper)
+    return end - state.values
+
+
+def _length(step, state):
+    """Return the largest step, in tenths of its error or mils of its size."""
+    unit = 1e-3 * np.abs(state.values) + 0.1 / state.scale
+    return np.max(np.abs(step) / unit, initial=0)

@@ -1,0 +1,225 @@
+"""Which stars of an image the PSF can be measured from."""
+import warnings
+
+import numpy as np
+from astropy.stats import mad_std
+from astropy.table import QTable, Table
+from photutils.detection import DAOStarFinder
+from photutils.utils.exceptions import NoDetectionsWarning
+from scipy.spatial import KDTree
+
+from photutils_mgauss._star_stamps import cut_stamps
+from photutils_mgauss._tables import as_image, read_sources
+from photutils_mgauss._validation import as_integer, as_real
+
+__all__ = ['select_psf_stars']
+
+# A neighbour counts if it has more than this share of the star's light.
+_NEIGHBOUR_SHARE = 0.01
+# Stars whose light is more or less concentrated than that of most, by this
+# many robust standard deviations and this share, are no single stars.
+_SHAPE_LIMIT = 5.0
+_SHAPE_SHARE = 0.15
+
+
+def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
+                     threshold=None, radius=10, isolation=None,
+                     saturation=None, min_snr=50, max_stars=None,
+                     finder=None):
+    """
+    Choose bright, isolated, unsaturated stars with whole stamps.
+
+    Parameters
+    ----------
+    data : (ny, nx) array_like
+        The image, its background subtracted.
+    sources : `~astropy.table.Table`, optional
+        A catalogue with ``x``, ``y`` (or ``x_fit``, ``x_centroid``, ...) and
+        perhaps ``flux``. By default sources are detected.
+    error : (ny, nx) array_like, optional
+        The standard deviation of each pixel; by default the scatter of the
+        image.
+    mask : (ny, nx) array_like of bool, optional
+        True for pixels that cannot be used.
+    fwhm : float, optional
+        The width of stars [pix] for their detection, 3 by default.
+    threshold : float, optional
+        The height of a detection in the unit of ``data``; 5 times the
+        scatter of the image by default.
+    radius : float, optional
+        The radius of the stamps [pix]. They must be inside the image.
+    isolation : float, optional
+        The least distance of a neighbour that has more than 1 % of the
+        star's light [pix]; ``radius`` by default.
+    saturation : float, optional
+        Stars with a pixel at or above this value are saturated.
+    min_snr : float, optional
+        The least signal-to-noise ratio of the flux within 3 pixels.
+    max_stars : int, optional
+        Keep only so many, the brightest of each part of the detector.
+    finder : callable, optional
+        A photutils star finder, called as ``finder(data, mask=mask)``;
+        by default a `~photutils.detection.DAOStarFinder`.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        All sources: ``id``, ``x``, ``y``, ``flux`` (within 3 pixels of the
+        star), ``snr``, ``peak``, ``selected`` and, for those that are not,
+        the ``reason``: 'outside', 'edge', 'masked', 'saturated', 'faint',
+        'neighbor', 'shape' or 'surplus'. `fit_mixture_field` takes it as it
+        is.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not valid or no source is found.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from photutils_mgauss import GaussianMixture, select_psf_stars
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0], [0, 2]]])
+    >>> data = np.random.default_rng(1).normal(0, 1, (64, 64))
+    >>> for x, y in [(20, 30.2), (44.7, 41), (3, 50), (22, 34)]:
+    ...     data += psf.render((64, 64), x, y, flux=3000)
+    >>> stars = select_psf_stars(data)
+    >>> for star in stars:
+    ...     print(f"{star['x']:.0f} {star['y']:.0f} {star['reason'] or 'ok'}")
+    20 30 neighbor
+    22 34 neighbor
+    45 41 ok
+    3 50 edge
+    """
+    data = as_image(data, 'data')
+    error = None if error is None else as_image(error, 'error', data.shape)
+    mask = None if mask is None else as_image(mask, 'mask',
+                                              data.shape).astype(bool)
+    radius = as_real(radius, 'radius', minimum=2)
+    isolation = (radius if isolation is None
+                 else as_real(isolation, 'isolation', minimum=0))
+    min_snr = as_real(min_snr, 'min_snr', minimum=0)
+    if max_stars is not None:
+        max_stars = as_integer(max_stars, 'max_stars', minimum=1)
+    if sources is None:
+        sources = _detect(data, mask, fwhm, threshold, finder)
+    table = _measure(data, error, mask, read_sources(sources), radius)
+    _judge(table, isolation, saturation, min_snr)
+    if max_stars is not None:
+        _thin_out(table, max_stars, data.shape)
+    table['selected'] = table['reason'] == ''
+    table.remove_columns([name for name in table.colnames
+                          if name.startswith('_')])
+    return table
+
+
+def _detect(data, mask, fwhm, threshold, finder):
+    bad = ~np.isfinite(data)
+    mask = bad if mask is None else mask | bad
+    data = np.where(bad, 0, data)
+    if finder is None:
+        fwhm = 3.0 if fwhm is None else as_real(fwhm, 'fwhm', above=0)
+        if threshold is None:
+            threshold = 5 * mad_std(data[~mask])
+        threshold = as_real(threshold, 'threshold', above=0)
+        # Sharp and flat sources are judged later, with a reason.
+        finder = DAOStarFinder(threshold, fwhm, scale_threshold=False,
+                               min_separation=0.5 * fwhm, sharpness_range=None,
+                               roundness_range=None)
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', NoDetectionsWarning)
+        found = finder(data, mask=mask)
+    if found is None or len(found) == 0:
+        msg = 'data must show at least 1 source, the finder found none'
+        raise ValueError(msg)
+    # The finder's flux is not that of the aperture used here.
+    return Table({'x': found['x_centroid'], 'y': found['y_centroid']})
+
+
+def _measure(data, error, mask, sources, radius):
+    stamps = cut_stamps(data, error, mask, sources.x, sources.y, radius)
+    if error is None:
+        stamps.base[:] = mad_std(data, ignore_nan=True) ** 2
+    inner = stamps.good & (stamps.offsets() <= 3)
+    light = np.where(inner, stamps.data, 0)
+    flux = light.sum(axis=(1, 2))
+    noise = np.sqrt(np.where(inner, stamps.base, 0).sum(axis=(1, 2)))
+    core = np.where(stamps.offsets() <= 1, light, 0).sum(axis=(1, 2))
+    n_circle = np.count_nonzero(stamps.offsets() <= radius + 0.5)
+    table = QTable()
+    table['id'] = np.arange(1, len(flux) + 1)
+    table['x'], table['y'], table['flux'] = sources.x, sources.y, flux
+    table['snr'] = flux / np.maximum(noise, 1e-300)
+    table['peak'] = light.max(axis=(1, 2))
+    table['_core'] = core / np.where(flux > 0, flux, np.inf)
+    table['_good'] = stamps.good.sum(axis=(1, 2)) / n_circle
+    half = stamps.radius
+    ny, nx = data.shape
+    with np.errstate(invalid='ignore'):
+        table['_margin'] = np.min([sources.x - half, nx - 1 - half
+                                   - sources.x, sources.y - half, ny - 1
+                                   - half - sources.y], axis=0)
+    return table
+
+
+def _judge(table, isolation, saturation, min_snr):
+    """Fill the column of reasons; the first that applies is given."""
+    margin = np.nan_to_num(table['_margin'], nan=-np.inf)
+    peak_limit = np.inf if saturation is None else as_real(saturation,
+                                                           'saturation')
+    checks = [
+        ('outside', table['_good'] == 0),
+        ('edge', margin < -0.5),
+        ('saturated', table['peak'] >= peak_limit),
+        ('masked', table['_good'] < 1),
+        ('faint', table['snr'] < min_snr),
+        ('neighbor', _has_neighbour(table, isolation))]
+    reason = np.full(len(table), '', dtype='U9')
+    for name, applies in checks:
+        reason[(reason == '') & np.asarray(applies)] = name
+    reason[(reason == '') & _odd_shape(table['_core'], reason == '')] = 'shape'
+    table['reason'] = reason
+
+
+def _has_neighbour(table, isolation):
+    found = np.zeros(len(table), bool)
+    known = np.flatnonzero(np.isfinite(table['x']) & np.isfinite(table['y']))
+    if known.size < 2 or isolation == 0:
+        return found
+    places = np.column_stack([table['x'], table['y']])[known]
+    pairs = known[KDTree(places).query_pairs(isolation, output_type='ndarray')]
+    flux = np.asarray(table['flux'])
+    for a, b in ((0, 1), (1, 0)):
+        star, other = pairs[:, a], pairs[:, b]
+        found[star[flux[other] > _NEIGHBOUR_SHARE * flux[star]]] = True
+    return found
+
+
+def _odd_shape(core, candidates):
+    """Return which stars are sharper or broader than the others."""
+    if candidates.sum() < 5:
+        return np.zeros(core.size, bool)
+    middle = np.median(core[candidates])
+    scatter = 1.4826 * np.median(np.abs(core[candidates] - middle))
+    limit = max(_SHAPE_LIMIT * scatter, _SHAPE_SHARE * middle)
+    return np.abs(core - middle) > limit
+
+
+def _thin_out(table, max_stars, shape):
+    """Keep the brightest of each cell of the detector in turn."""
+    rows = np.flatnonzero(table['reason'] == '')
+    if rows.size <= max_stars:
+        return
+    n = max(1, int(np.sqrt(max_stars / 4)))
+    ny, nx = shape
+    cell = (np.clip(table['x'][rows] / nx * n, 0, n - 1).astype(int)
+            + n * np.clip(table['y'][rows] / ny * n, 0, n - 1).astype(int))
+    order = np.argsort(-np.asarray(table['flux'][rows]))
+    rank = np.empty(rows.size, int)
+    for number in np.unique(cell):
+        inside = order[cell[order] == number]
+        rank[inside] = np.arange(inside.size)
+    keep = np.lexsort((-np.asarray(table['flux'][rows]), rank))[:max_stars]
+    surplus = np.ones(rows.size, bool)
+    surplus[keep] = False
+    table['reason'][rows[surplus]] = 'surplus'

@@ -1,0 +1,606 @@
+"""ProperMotionFitter beside the truth, published values and other fits."""
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import Angle, SkyCoord
+from astropy.table import QTable, Table
+from motion_scenes import (
+    TIMES,
+    make_truth,
+    observe,
+    pulls,
+    tan_wcs,
+)
+from numpy.testing import assert_allclose
+
+from photutils_mgauss import (
+    Epoch,
+    ProperMotionFitter,
+    decode_motion_flags,
+)
+
+
+def rms(values):
+    return np.sqrt(np.nanmean(np.square(values)))
+
+
+def plane_epochs(rng, n=40, years=(2020.0, 2021.5, 2024.0), error=0.01,
+                 **columns):
+    """Return epochs in pixels, with errors, and the true motions."""
+    place, motion = rng.uniform(0, 500, (2, n)), rng.normal(0, 0.1, (2, n))
+    epochs = []
+    for year in years:
+        x, y = (place + motion * (year - years[0])
+                + rng.normal(0, error, (2, n)))
+        epochs.append(Epoch(Table({
+            'id': np.arange(n), 'x_fit': x, 'y_fit': y,
+            'x_err': np.full(n, error), 'y_err': np.full(n, error),
+            **columns}), time=year))
+    return epochs, motion
+
+
+def changed(epoch, **columns):
+    """Return an epoch with some columns of its table replaced."""
+    table = epoch.table.copy()
+    for name, values in columns.items():
+        table[name] = values
+    return Epoch(table, epoch.wcs, epoch.time, observer=epoch.observer)
+
+
+@pytest.fixture(scope='module')
+def scene():
+    rng = np.random.default_rng(11)
+    truth = make_truth(rng, n_stars=2000, n_qso=600)
+    return truth, observe(truth, rng, edge=3.0)
+
+
+@pytest.fixture(scope='module')
+def quasars(scene):
+    truth, _ = scene
+    rng = np.random.default_rng(12)
+    return rng.choice(np.flatnonzero(truth.qso), 300, replace=False)
+
+
+@pytest.fixture(scope='module')
+def solution(scene, quasars):
+    return ProperMotionFitter(references=quasars).fit(scene[1])
+
+
+# Against the truth
+
+def test_motions_scatter_by_their_errors(scene, quasars, solution):
+    truth, _ = scene
+    stars = solution.stars[~np.isin(solution.stars['id'], quasars)]
+    sigma = truth.sigma[stars['id']]
+    for group in (sigma < 2, sigma >= 2):
+        assert_allclose(rms(pulls(stars[group], truth)), 1, atol=0.06)
+
+
+def test_chi_square_is_as_large_as_its_degrees_of_freedom(solution):
+    stars = solution.stars
+    assert_allclose(np.nansum(stars['chi2']) / np.nansum(stars['dof']), 1,
+                    atol=0.03)
+    assert_allclose(np.nanmedian(stars['uwe']), 1, atol=0.05)
+
+
+def test_maps_undo_what_the_wcs_had_wrong(scene, solution):
+    # The offsets of the WCS were 100 mas, their stretch 3 mas at the edge.
+    assert (solution.alignment['shift_error'] < 1 * u.mas).all()
+    moved = solution.alignment['shift'] - solution.alignment['shift'].mean(
+        axis=0)
+    assert moved.std() > 30 * u.mas
+    assert_allclose(solution.alignment['matrix'],
+                    np.tile(np.eye(2), (7, 1, 1)), atol=1e-4)
+
+
+def test_a_joint_solution_is_no_worse_than_two_steps(scene, quasars,
+                                                     solution):
+    truth, epochs = scene
+    two = ProperMotionFitter(references=quasars,
+                             recipe='two-step').fit(epochs)
+    assert np.nanmedian(solution.stars['pmra_error']) <= (
+        1.001 * np.nanmedian(two.stars['pmra_error']))
+    test = ~np.isin(solution.stars['id'], quasars)
+    errors = [(one.stars['pmra'].value - truth.pm[0, one.stars['id']])[test]
+              for one in (solution, two)]
+    assert rms(errors[0]) < 1.01 * rms(errors[1])
+
+
+def test_positions_and_parallaxes_scatter_by_their_errors():
+    rng = np.random.default_rng(3)
+    truth = make_truth(rng, n_stars=1500, n_qso=500, parallax=2.0)
+    epochs = observe(truth, rng)
+    gaia = gaia_table(truth, rng, np.flatnonzero(~truth.qso)[:300])
+    fit = ProperMotionFitter(references=gaia, parallax=True,
+                             ref_epoch=2016.0).fit(epochs)
+    stars = fit.stars[~np.isin(fit.stars['id'], gaia['id'])]
+    which = np.asarray(stars['id'])
+    parallax = ((stars['parallax'].value - truth.parallax[which])
+                / stars['parallax_error'].value)
+    place = offsets(stars, truth, 2016.0)
+    for pull in (parallax, *place, *pulls(stars, truth)):
+        assert_allclose(rms(pull), 1, atol=0.06)
+    assert fit.notes == ()
+
+
+def gaia_table(truth, rng, which, error=0.1):
+    """Return a catalogue of some stars with Gaia's columns, at 2016.0."""
+    sky = SkyCoord(truth.ra[which] * u.deg, truth.dec[which] * u.deg)
+    years = 2016.0 - truth.year0
+    noise = error * rng.normal(size=(5, len(which)))
+    pm = truth.pm[:, which]
+    moved = sky.spherical_offsets_by(
+        (pm[0] * years + noise[0]) * u.mas, (pm[1] * years + noise[1]) * u.mas)
+    errors = {f'{name}_error': np.full(len(which), error)
+              for name in ('ra', 'dec', 'parallax', 'pmra', 'pmdec')}
+    return Table({'id': which, 'ra': moved.ra.deg, 'dec': moved.dec.deg,
+                  'pmra': pm[0] + noise[2], 'pmdec': pm[1] + noise[3],
+                  'parallax': truth.parallax[which] + noise[4],
+                  'ref_epoch': np.full(len(which), 2016.0), **errors})
+
+
+def offsets(stars, truth, year):
+    """Return (ra, dec - truth) / error at a year, as pulls."""
+    which = np.asarray(stars['id'])
+    origin = SkyCoord(truth.ra[which] * u.deg, truth.dec[which] * u.deg)
+    found = SkyCoord(stars['ra'], stars['dec'])
+    away = origin.spherical_offsets_to(found)
+    expected = truth.pm[:, which] * (year - truth.year0)
+    return [(angle.to_value(u.mas) - expected[k]) / stars[name].to_value(u.mas)
+            for k, (angle, name) in enumerate(zip(
+                away, ('ra_error', 'dec_error'), strict=True))]
+
+
+def test_relative_motions_differ_from_the_truth_by_one_field(scene):
+    truth, epochs = scene
+    fit = ProperMotionFitter().fit(epochs)
+    stars = fit.stars
+    which = np.asarray(stars['id'])
+    design = np.column_stack([np.ones(len(which)), truth.ra[which] - 192.86,
+                              truth.dec[which] - 27.13])
+    for k, name in enumerate(('pmra', 'pmdec')):
+        error = stars[name].value - truth.pm[k, which]
+        sigma = stars[f'{name}_error'].value
+        good = np.isfinite(error)
+        field = np.linalg.lstsq(design[good] / sigma[good, None],
+                                error[good] / sigma[good], rcond=None)[0]
+        assert_allclose(rms((error - design @ field) / sigma), 1, atol=0.05)
+    assert any('Motions are relative' in note for note in fit.notes)
+    assert (stars['flags'] & 256 > 0).all()
+
+
+def test_errors_of_relative_motions_leave_out_their_mean(rng):
+    # Of n equal stars, each has 1 - 1/n of the variance left (shifts only).
+    n = 5
+    epochs, _ = plane_epochs(rng, n=n, years=(2020.0, 2024.0))
+    fit = ProperMotionFitter(transform='shift', systematic=None,
+                             clip=None).fit(epochs)
+    alone = 0.01 * np.sqrt(2) / 4
+    assert_allclose(fit.stars['pmra_error'].value, alone * np.sqrt(1 - 1 / n),
+                    rtol=1e-6)
+    assert_allclose(fit.stars['pmra'].value.mean(), 0, atol=1e-12)
+
+
+# Against other ways to the same numbers
+
+def whitened_fit(epochs, rows, plane_of, year):
+    """Fit one star by lstsq of whitened equations, frames known."""
+    design, values = [], []
+    for epoch, row in zip(epochs, rows, strict=True):
+        if row is None:
+            continue
+        place, covariance = plane_of(epoch, row)
+        white = np.linalg.inv(np.linalg.cholesky(covariance))
+        dt = epoch.mean_year - year
+        design.append(white @ np.array([[1, 0, dt, 0], [0, 1, 0, dt]]))
+        values.append(white @ place)
+    design, values = np.vstack(design), np.concatenate(values)
+    answer = np.linalg.lstsq(design, values, rcond=None)[0]
+    return answer, np.linalg.inv(design.T @ design)
+
+
+def test_batched_fits_equal_whitened_lstsq_star_by_star(rng):
+    n = 60
+    epochs, _ = plane_epochs(rng, n=n, years=(2020.0, 2021.0, 2023.5, 2024.0))
+    covariances = {}
+    for k, epoch in enumerate(epochs):
+        errors = rng.uniform(0.002, 0.05, (2, n))
+        rho = rng.uniform(-0.9, 0.9, n)
+        epochs[k] = changed(epoch, x_err=errors[0], y_err=errors[1],
+                            xy_cov=rho * errors[0] * errors[1])
+        covariances[k] = errors, rho
+    fit = ProperMotionFitter(transform=None, systematic=None, clip=None,
+                             ref_epoch=2022.0).fit(epochs)
+
+    def plane_of(epoch, row):
+        line = epoch.table[row]
+        covariance = [[line['x_err']**2, line['xy_cov']],
+                      [line['xy_cov'], line['y_err']**2]]
+        return np.array([line['x_fit'], line['y_fit']]), covariance
+    for i in range(n):
+        answer, covariance = whitened_fit(epochs, [i] * 4, plane_of, 2022.0)
+        star = fit.stars[i]
+        got = [star[name].value for name in ('x', 'y', 'pmra', 'pmdec')]
+        assert_allclose(got, answer, rtol=1e-9)
+        errors = [star[f'{name}_error'].value
+                  for name in ('ra', 'dec', 'pmra', 'pmdec')]
+        assert_allclose(errors, np.sqrt(np.diag(covariance)), rtol=1e-9)
+        assert_allclose(star['pmra_pmdec_corr'] * errors[2] * errors[3],
+                        covariance[2, 3], rtol=1e-7, atol=1e-12)
+
+
+def test_a_joint_solution_equals_one_big_least_squares_fit(rng):
+    """All unknowns in one dense matrix, quasars' motions left out of it."""
+    n, n_qso = 12, 5
+    years = np.array([2020.0, 2021.0, 2023.0])
+    epochs, _ = plane_epochs(rng, n=n, years=years)
+    for k, epoch in enumerate(epochs):
+        still = epochs[0].table
+        for name in ('x_fit', 'y_fit'):
+            epoch.table[name][:n_qso] = (still[name][:n_qso]
+                                         + 0.01 * rng.normal(size=n_qso))
+        epochs[k] = changed(epoch)
+    fit = ProperMotionFitter(transform='shift', systematic=None, clip=None,
+                             references=list(range(n_qso))).fit(epochs)
+    # One axis alone: x_ie = x_i + mu_i dt_e - s_e, with sum of s_e zero.
+    dt = years - years.mean()
+    columns = np.zeros((3, n, 2 * n + 3))
+    for e in range(3):
+        for i in range(n):
+            columns[e, i, i] = 1
+            columns[e, i, n + i] = dt[e] * (i >= n_qso)
+            columns[e, i, 2 * n + e] = -1
+    gauge = np.zeros(2 * n + 3)
+    gauge[2 * n:] = 1
+    keep = [k for k in range(2 * n + 3) if not n <= k < n + n_qso]
+    design = np.vstack([columns.reshape(-1, 2 * n + 3) / 0.01, gauge])[:, keep]
+    values = np.append(np.concatenate(
+        [epoch.table['x_fit'] for epoch in epochs]) / 0.01, 0)
+    answer = np.linalg.lstsq(design, values, rcond=None)[0]
+    covariance = np.linalg.inv(design.T @ design)
+    motions = slice(n, n + n - n_qso)
+    assert_allclose(fit.stars['pmra'].value[n_qso:], answer[motions],
+                    atol=1e-9)
+    assert_allclose(fit.stars['pmra_error'].value[n_qso:],
+                    np.sqrt(np.diag(covariance)[motions]), rtol=1e-6)
+    shift = fit.alignment['shift'][:, 0].value
+    assert_allclose(shift - shift.mean(), answer[-3:], atol=1e-8)
+
+
+def test_rows_in_another_order_give_the_same_motions(scene, solution,
+                                                     quasars, rng):
+    _, epochs = scene
+    mixed = []
+    for epoch in epochs[::-1]:
+        order = rng.permutation(len(epoch.table))
+        mixed.append(Epoch(epoch.table[order], epoch.wcs, epoch.time))
+    again = ProperMotionFitter(references=quasars).fit(mixed).stars
+    again = again[np.argsort(again['id'])]
+    stars = solution.stars[np.argsort(solution.stars['id'])]
+    assert_allclose(again['pmra'].value, stars['pmra'].value, atol=1e-6)
+
+
+@pytest.mark.parametrize('dec', [0.0, 80.0, 89.9, 90.0, -89.99])
+@pytest.mark.parametrize('rotation', [0.0, 20.0, 90.0])
+def test_any_declination_and_rotation_gives_the_motions(dec, rotation):
+    rng = np.random.default_rng(8)
+    truth = make_truth(rng, n_stars=60, n_qso=60, ra=0.0, dec=dec, sigma=1e-3)
+    epochs = []
+    for time in TIMES[[0, 3, 6]]:
+        wcs = tan_wcs(0.0, dec, rotation=rotation, mirrored=rotation != 20)
+        # Near the pole a shift of all positions turns the local axes, so
+        # the frames here start right.
+        epochs += observe(truth, rng, times=[time], offset=0, wcs=wcs,
+                          missing=0)
+    fit = ProperMotionFitter(references=np.flatnonzero(truth.qso),
+                             transform='similarity',
+                             ref_epoch=truth.year0).fit(epochs)
+    assert np.abs(pulls(fit.stars, truth)).max() < 5
+    assert_allclose(fit.stars['pmra'].value, truth.pm[0, fit.stars['id']],
+                    atol=0.005)
+
+
+# Published values
+
+def test_the_pulsar_b0950_has_its_published_motion(realdata):
+    epochs = []
+    lines = (realdata('vlba_b0950') / 'example.pmpar').read_text()
+    for line in lines.splitlines():
+        words = line.split()
+        if len(words) < 5 or ':' not in words[1]:
+            continue
+        dec = Angle(words[3], unit=u.deg).deg
+        seconds = 15e3 * np.cos(np.radians(dec))
+        epochs.append(Epoch(Table({
+            'ra': [Angle(words[1], unit=u.hourangle).deg], 'dec': [dec],
+            'ra_error': [float(words[2]) * seconds],
+            'dec_error': [float(words[4]) * 1e3]}), time=float(words[0])))
+    star = ProperMotionFitter(transform=None, parallax=True).fit(
+        epochs).stars[0]
+    for name, value, error in (('pmra', -1.67, 0.42), ('pmdec', 29.33, 0.28),
+                               ('parallax', 3.69, 0.17)):
+        assert_allclose(star[name].value, value, atol=0.006)
+        assert_allclose(star[f'{name}_error'].value, error, atol=0.006)
+    assert_allclose([star['chi2'], star['dof']], [2.16, 3], atol=0.006)
+
+
+def keck(folder):
+    """Return the epochs and the label table of keck_ob150029."""
+    names = ['name', 'm', 't', 'x', 'y', 'xe', 'ye', 'snr', 'corr',
+             'n_frames', 'flux']
+    epochs = []
+    for path in sorted(folder.glob('mag*.lis')):
+        rows = [line.split() for line in path.read_text().splitlines()[1:]]
+        table = Table(dict(zip(names, map(list, zip(*rows, strict=True)),
+                               strict=True)))
+        positions = {new: table[old].astype(float) for old, new in (
+            ('x', 'x'), ('y', 'y'), ('xe', 'x_err'), ('ye', 'y_err'))}
+        epochs.append(Epoch(Table({'id': table['name'], **positions}),
+                            time=float(table['t'][0])))
+    names = ['id', 'kp', 'x', 'y', 'xerr', 'yerr', 'pmra', 'pmdec',
+             'pmra_error', 'pmdec_error', 't0']
+    rows = [line.split()[:11] for line in (
+        folder / 'ob150029_label.txt').read_text().splitlines()[1:]]
+    label = Table(dict(zip(names, map(list, zip(*rows, strict=True)),
+                           strict=True)))
+    for name in names[1:]:
+        label[name] = label[name].astype(float)
+    return epochs, label[label['pmra_error'] > 0]
+
+
+def label_catalogue(label):
+    catalogue = QTable({'id': label['id'], 'ref_epoch': label['t0']})
+    for name in ('x', 'y'):
+        catalogue[name] = label[name] * u.arcsec
+        catalogue[f'{name}_error'] = np.full(len(label), 1.0) * u.mas
+    for name in ('pmra', 'pmdec', 'pmra_error', 'pmdec_error'):
+        catalogue[name] = label[name] * u.mas / u.yr
+    return catalogue
+
+
+def differences(stars, label):
+    """Return the motions of a table minus the published ones [mas/yr]."""
+    row = {name: i for i, name in enumerate(stars['id'])}
+    both = [(row[name], k) for k, name in enumerate(label['id'])
+            if name in row]
+    i, k = np.array(both).T
+    away = np.stack([stars[name][i].to_value(u.mas / u.yr) - label[name][k]
+                     for name in ('pmra', 'pmdec')])
+    return away[:, np.isfinite(away).all(axis=0)]
+
+
+@pytest.mark.parametrize(('transform', 'recipe'), [
+    ('affine', 'joint'), ('affine', 'two-step'), ('poly-2', 'joint')])
+def test_keck_motions_agree_with_the_published_ones(realdata, transform,
+                                                    recipe):
+    epochs, label = keck(realdata('keck_ob150029'))
+    fit = ProperMotionFitter(references=label_catalogue(label),
+                             transform=transform, recipe=recipe).fit(epochs)
+    away = differences(fit.measured(), label)
+    assert away.shape[1] >= 90
+    middle = np.median(away, axis=1)
+    assert (np.abs(middle) < 0.04).all()
+    spread = np.median(np.abs(away - middle[:, None]), axis=1)
+    assert (spread <= [0.19, 0.30]).all()
+    sizes = np.linalg.svd(fit.alignment['matrix'])[1]
+    assert ((sizes > 9.92) & (sizes < 9.94)).all()
+
+
+def test_two_keck_epochs_give_motions(realdata):
+    epochs, label = keck(realdata('keck_ob150029'))
+    fit = ProperMotionFitter(references=label_catalogue(label)).fit(
+        [epochs[0], epochs[-1]])
+    stars = fit.measured()
+    away = differences(stars, label)
+    assert away.shape[1] >= 80
+    middle = np.median(away, axis=1)
+    spread = np.median(np.abs(away - middle[:, None]), axis=1)
+    assert (spread < 0.6).all()
+    for name in ('chi2', 'dof', 'uwe'):
+        assert np.isnan(stars[name]).all()
+
+
+# What goes wrong: an error for what cannot be fitted, a flag for one star
+
+def test_epochs_without_common_stars_raise(rng):
+    epochs, _ = plane_epochs(rng)
+    epochs = [changed(epoch, id=epoch.table['id'] + 100 * k)
+              for k, epoch in enumerate(epochs)]
+    with pytest.raises(ValueError, match='epochs must have stars in common'):
+        ProperMotionFitter().fit(epochs)
+
+
+def test_no_time_baseline_raises(rng):
+    epochs, _ = plane_epochs(rng, years=(2020.0, 2020.0))
+    with pytest.raises(ValueError, match='time baseline'):
+        ProperMotionFitter().fit(epochs)
+
+
+def test_exposures_of_one_time_are_data(rng):
+    epochs, _ = plane_epochs(rng, years=(2020.0, 2020.0, 2024.0, 2024.0))
+    fit = ProperMotionFitter(transform='shift', systematic=None).fit(epochs)
+    # Two exposures at each end halve the variance of one.
+    assert_allclose(np.median(fit.stars['pmra_error'].value), 0.01 / 4,
+                    rtol=0.02)
+    assert (fit.stars['flags'] & 1 == 0).all()
+
+
+@pytest.mark.parametrize(('transform', 'n'), [
+    ('shift', 0), ('similarity', 1), ('affine', 2), ('poly-2', 5)])
+def test_too_few_references_raise(rng, transform, n):
+    epochs, _ = plane_epochs(rng)
+    marked = [changed(epoch, qso=np.arange(40) < max(n, 1))
+              for epoch in epochs]
+    if n == 0:
+        marked[1] = changed(marked[1], x_err=np.where(
+            marked[1].table['qso'], np.nan, 0.01))
+    with pytest.raises(ValueError, match=f'got {n}$'):
+        ProperMotionFitter(transform=transform, references='qso').fit(marked)
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
+def test_a_position_that_is_not_finite_is_flagged(rng, value):
+    epochs, _ = plane_epochs(rng)
+    clean = ProperMotionFitter(systematic=None).fit(epochs)
+    epochs[1].table['x_fit'][3] = value
+    fit = ProperMotionFitter(systematic=None).fit(epochs)
+    assert [words.split(':')[0] for words in decode_motion_flags(
+        fit.stars['flags'][3])] == ['bad_position', 'relative']
+    assert fit.stars['n_good_obs'][3] == 2
+    assert np.isfinite(fit.stars['pmra']).all()
+    others = np.arange(40) != 3
+    assert_allclose(fit.stars['pmra'][others].value,
+                    clean.stars['pmra'][others].value, atol=0.003)
+
+
+def test_a_masked_position_is_flagged(rng):
+    epochs, _ = plane_epochs(rng)
+    table = Table(epochs[1].table, masked=True)
+    table['y_fit'].mask[5] = True
+    epochs[1] = Epoch(table, time=epochs[1].time)
+    stars = ProperMotionFitter().fit(epochs).stars
+    assert np.flatnonzero(stars['flags'] & 4).tolist() == [5]
+
+
+@pytest.mark.parametrize('error', [0.0, -1.0, np.nan, np.inf])
+def test_an_error_that_is_not_positive_has_no_weight(rng, error):
+    epochs, _ = plane_epochs(rng)
+    epochs[2].table['y_err'][7] = error
+    stars = ProperMotionFitter().fit(epochs).stars
+    assert np.flatnonzero(stars['flags'] & 2).tolist() == [7]
+    assert stars['n_good_obs'][7] == 2
+    assert stars['n_obs'][7] == 3
+
+
+def test_a_singular_covariance_has_no_weight(rng):
+    epochs, _ = plane_epochs(rng)
+    epochs = [changed(epoch, xy_cov=np.zeros(40)) for epoch in epochs]
+    epochs[0].table['xy_cov'][2] = 0.01**2
+    stars = ProperMotionFitter().fit(epochs).stars
+    assert np.flatnonzero(stars['flags'] & 2).tolist() == [2]
+
+
+def test_a_star_seen_once_is_nan_and_flagged(rng):
+    epochs, _ = plane_epochs(rng)
+    epochs[1] = Epoch(epochs[1].table[1:], time=epochs[1].time)
+    epochs[2] = Epoch(epochs[2].table[1:], time=epochs[2].time)
+    stars = ProperMotionFitter().fit(epochs).stars
+    assert np.flatnonzero(stars['flags'] & 1).tolist() == [0]
+    assert np.isnan(stars['pmra'][0])
+    assert np.isfinite(stars['pmra'][1:]).all()
+
+
+def test_two_epochs_give_motions_without_a_chi_square(rng):
+    epochs, _ = plane_epochs(rng, years=(2020.0, 2024.0))
+    stars = ProperMotionFitter(transform='shift').fit(epochs).stars
+    assert np.isfinite(stars['pmra_error']).all()
+    for name in ('chi2', 'dof', 'uwe'):
+        assert np.isnan(stars[name]).all()
+
+
+def test_parallaxes_without_coverage_are_nan(scene):
+    _, epochs = scene
+    fit = ProperMotionFitter(transform=None, parallax=True,
+                             systematic=None).fit([epochs[0], epochs[6]])
+    for name in ('pmra', 'pmdec', 'parallax', 'ra_error', 'dec_error'):
+        assert np.isnan(fit.stars[name]).all()
+    assert (fit.stars['flags'] & 1).all()
+
+
+def test_one_wild_detection_is_rejected_and_the_rest_kept(scene, quasars):
+    truth, epochs = scene
+    row = int(np.flatnonzero(~epochs[3].table['qso'])[10])
+    wild = epochs[3].table.copy()
+    wild['x_fit'][row] += 1.0
+    star = wild['id'][row]
+    bad = [*epochs[:3], Epoch(wild, epochs[3].wcs, epochs[3].time),
+           *epochs[4:]]
+    fit = ProperMotionFitter(references=quasars).fit(bad)
+    line = fit.stars[fit.stars['id'] == star][0]
+    assert line['flags'] & 8
+    assert np.abs(pulls(fit.stars[fit.stars['id'] == star], truth)).max() < 5
+    lost = fit.residuals[~fit.residuals['used']]
+    assert (star, 3) in zip(lost['id'], lost['epoch'], strict=True)
+    assert len(lost) < 5
+
+
+def test_a_moving_reference_is_found_out(scene, quasars):
+    truth, epochs = scene
+    mover = np.flatnonzero((np.abs(truth.pm[0]) > 8) & (truth.sigma < 2))[0]
+    fit = ProperMotionFitter(references=[*quasars, mover]).fit(epochs)
+    line = fit.stars[fit.stars['id'] == mover]
+    assert line['flags'][0] & 32
+    assert np.abs(pulls(line, truth)).max() < 5
+    assert np.sum(fit.stars['flags'] & 32 > 0) < 3
+
+
+@pytest.mark.parametrize(('keywords', 'words'), [
+    ({'transform': 'banana'}, 'transform must be'),
+    ({'transform': 'poly-0'}, 'transform must be'),
+    ({'recipe': 'soup'}, 'recipe must be'),
+    ({'parallax': 'maybe'}, 'parallax must be'),
+    ({'systematic': 'some'}, 'systematic must be'),
+    ({'clip': -1}, 'clip must be'),
+    ({'match_by': 'eye'}, 'match_by must be'),
+    ({'hold_out': 2}, 'hold_out must be'),
+])
+def test_options_are_checked_when_they_are_given(keywords, words):
+    with pytest.raises(ValueError, match=words):
+        ProperMotionFitter(**keywords)
+
+
+@pytest.mark.parametrize(('keywords', 'words'), [
+    ({'match_radius': 1.0}, 'match_radius must be a Quantity'),
+    ({'systematic': 1.0}, 'systematic must be a Quantity'),
+    ({'executor': 3}, 'executor must be'),
+])
+def test_options_of_a_wrong_type_are_refused(keywords, words):
+    with pytest.raises(TypeError, match=words):
+        ProperMotionFitter(**keywords)
+
+
+def test_parallaxes_need_a_sky(rng):
+    epochs, _ = plane_epochs(rng)
+    with pytest.raises(ValueError, match='parallax must be False'):
+        ProperMotionFitter(parallax=True).fit(epochs)
+
+
+def test_a_single_epoch_is_refused(rng):
+    epochs, _ = plane_epochs(rng)
+    with pytest.raises(ValueError, match='at least 2'):
+        ProperMotionFitter().fit(epochs[:1])
+    with pytest.raises(TypeError, match='sequence of Epoch'):
+        ProperMotionFitter().fit(epochs[0])
+
+
+# The table
+
+def test_the_table_has_the_names_and_units_of_gaia(solution, tmp_path):
+    stars = solution.stars
+    names = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
+    for i, name in enumerate(names):
+        assert f'{name}_error' in stars.colnames
+        for other in names[i + 1:]:
+            assert f'{name}_{other}_corr' in stars.colnames
+    assert stars['pmra'].unit == u.mas / u.yr
+    assert stars['ra'].unit == u.deg
+    assert stars['ra_error'].unit == u.mas
+    for form in ('ecsv', 'fits'):
+        path = tmp_path / f'stars.{form}'
+        stars.write(path)
+        back = QTable.read(path)
+        assert_allclose(back['pmra'].value, stars['pmra'].value)
+        assert back['pmra'].unit == u.mas / u.yr
+
+
+def test_residuals_are_those_of_the_aligned_positions(solution):
+    table = solution.residuals
+    used = table[table['used']]
+    stars = solution.stars
+    share = np.nansum(stars['dof']) / np.sum(2 * stars['n_good_obs'])
+    assert_allclose(rms(used['dra'] / used['dra_error']), np.sqrt(share),
+                    atol=0.02)
+    assert np.nanmedian(table['chi2']) == pytest.approx(2 * np.log(2),
+                                                        rel=0.05)
+    bigger = np.abs(used['dra_left_out']) >= np.abs(used['dra']) * 0.999
+    assert bigger[np.isfinite(used['dra_left_out'])].mean() > 0.95

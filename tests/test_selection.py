@@ -1,0 +1,97 @@
+"""Every star that cannot show the PSF is rejected, with its reason."""
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from photutils_mgauss import GaussianMixture, select_psf_stars
+
+PSF = GaussianMixture([1], [[0, 0]], [[[2, 0], [0, 2]]])
+SHAPE = (160, 200)
+GOOD = [(30, 30.2), (70.4, 30), (110, 30), (150.3, 30), (30, 120.4),
+        (70, 120.6)]
+
+
+@pytest.fixture
+def data(rng):
+    data = rng.normal(0, 1, SHAPE)
+    for x, y in GOOD:
+        data += PSF.render(SHAPE, x, y, flux=5000)
+    return data
+
+
+def reason_at(table, x, y):
+    nearest = np.hypot(table['x'] - x, table['y'] - y).argmin()
+    return table['reason'][nearest]
+
+
+def test_good_stars_are_selected(data):
+    table = select_psf_stars(data)
+    assert all(reason_at(table, x, y) == '' for x, y in GOOD)
+    assert table['selected'].sum() == len(GOOD)
+
+
+def test_a_star_at_the_edge_is_rejected(data):
+    data += PSF.render(SHAPE, 5, 80, flux=5000)
+    assert reason_at(select_psf_stars(data), 5, 80) == 'edge'
+
+
+def test_a_saturated_star_is_rejected(data):
+    data += PSF.render(SHAPE, 110, 80, flux=1e5)
+    data = np.minimum(data, 2000)
+    table = select_psf_stars(data, saturation=2000)
+    assert reason_at(table, 110, 80) == 'saturated'
+
+
+def test_a_star_with_a_masked_or_nan_pixel_is_rejected(data):
+    mask = np.zeros(SHAPE, bool)
+    mask[33, 28] = True
+    data[28, 69] = np.nan
+    table = select_psf_stars(data, mask=mask)
+    assert reason_at(table, 30, 30) == 'masked'
+    assert reason_at(table, 70, 30) == 'masked'
+
+
+def test_a_faint_star_is_rejected(data):
+    data += PSF.render(SHAPE, 110, 80, flux=150)
+    table = select_psf_stars(data, min_snr=50)
+    assert reason_at(table, 110, 80) == 'faint'
+
+
+def test_a_neighbour_counts_only_if_it_is_bright_enough(data):
+    data += PSF.render(SHAPE, 116, 30, flux=400)
+    data += PSF.render(SHAPE, 36, 30, flux=0)
+    table = select_psf_stars(data)
+    assert reason_at(table, 110, 30) == 'neighbor'
+    assert reason_at(table, 30, 30) == ''
+    table = select_psf_stars(data, isolation=4)
+    assert reason_at(table, 110, 30) == ''
+
+
+def test_what_is_no_single_star_is_rejected(data):
+    data[80, 110] += 2000
+    wide = PSF.convolve([[9, 0], [0, 9]])
+    data += wide.render(SHAPE, 150, 80, flux=20000)
+    table = select_psf_stars(data)
+    assert reason_at(table, 110, 80) == 'shape'
+    assert reason_at(table, 150, 80) == 'shape'
+
+
+def test_surplus_stars_are_the_faintest_of_their_part(data):
+    data += PSF.render(SHAPE, 150, 120, flux=9000)
+    table = select_psf_stars(data, max_stars=4)
+    assert table['selected'].sum() == 4
+    assert np.sum(table['reason'] == 'surplus') == 3
+    assert reason_at(table, 150, 120) == ''
+
+
+def test_a_catalogue_keeps_its_positions_and_may_hold_nonsense(data):
+    catalogue = Table({'x_fit': [30.1, np.nan, 1e6],
+                       'y_fit': [30.0, 5.0, 5.0]})
+    table = select_psf_stars(data, catalogue)
+    assert table['x'][0] == 30.1
+    assert table['reason'].tolist() == ['', 'outside', 'outside']
+
+
+def test_an_empty_image_is_an_error(rng):
+    with pytest.raises(ValueError, match='at least 1 source'):
+        select_psf_stars(rng.normal(0, 1, (60, 60)), threshold=50)
