@@ -96,10 +96,10 @@ class Stars:
     """The stars of a tile, as parallel arrays."""
 
     COLUMNS = ('x', 'y', 'flux', 'x_init', 'y_init', 'flux_init',
-               'significance', 'round', 'number', 'seeded')
+               'significance', 'round', 'number', 'seeded', 'rows', 'count')
 
     def __init__(self, x, y, flux, *, significance=0, found_in=0, number=-1,
-                 seeded=False):
+                 seeded=False, n_rows=0):
         n = len(x)
         self.x, self.y, self.flux = (np.array(v, float) for v in (x, y, flux))
         self.x_init, self.y_init = self.x.copy(), self.y.copy()
@@ -108,6 +108,9 @@ class Stars:
         self.round = np.zeros(n, int) + found_in
         self.number = np.zeros(n, int) + number
         self.seeded = np.zeros(n, bool) | seeded
+        # The Gaussians of each star's PSF, filled in when it is drawn.
+        self.rows = np.empty((n, n_rows, 6))
+        self.count = np.zeros(n, int)
 
     def __len__(self):
         return self.x.size
@@ -175,7 +178,7 @@ class Tile:
         self.psf = job.psf
         self.options = job.options
         self.origin = job.origin
-        self.stars = Stars([], [], [])
+        self.stars = Stars([], [], [], n_rows=self.psf.n_rows)
         self.graves = np.empty((0, 2))
         self.weight = np.divide(1, self.variance, where=self.good,
                                 out=np.zeros(self.data.shape))
@@ -234,7 +237,8 @@ class Tile:
         """Evaluate all stamps, the residual and the weights."""
         s = self.stars
         everyone = np.arange(len(s))
-        psf = (*self.psf.rows_at(s.x, s.y), self.psf.integrated)
+        self._localise_psf()
+        psf = (s.rows, s.count, self.psf.integrated)
         _kernels.star_stamps(everyone, s.x, s.y, *self._place(), *psf,
                              self.jets)
         self.residual = self.data.copy()
@@ -247,6 +251,13 @@ class Tile:
             variance = self.variance - self.residual / self.options.gain
             variance = np.maximum(variance, self.options.floor)
             np.divide(1, variance, where=self.good, out=self.weight)
+
+    def _localise_psf(self):
+        """Find the PSF of stars that have none yet."""
+        s = self.stars
+        new = s.count == 0
+        if new.any():
+            s.rows[new], s.count[new] = self.psf.rows_at(s.x[new], s.y[new])
 
     def star_light(self):
         """Return the image of the stars alone."""
@@ -333,7 +344,8 @@ class Tile:
         y, x = np.nonzero(peak)
         dx, dy = _vertex(significance, x, y)
         found = Stars(x + dx, y + dy, flux[y, x],
-                      significance=significance[y, x], found_in=found_in)
+                      significance=significance[y, x], found_in=found_in,
+                      n_rows=self.psf.n_rows)
         found.select(self._apart(found))
         self.stars.append(found)
         return len(found)
@@ -398,7 +410,7 @@ class Tile:
         if found:
             x, y, flux, significance = np.array(found).T
             self.stars.append(Stars(x, y, flux, significance=significance,
-                                    seeded=True))
+                                    seeded=True, n_rows=self.psf.n_rows))
 
     def _wing_star(self, clumps, k):
         y, x = np.nonzero(clumps == k)
@@ -444,7 +456,8 @@ def solve_tile(job):
     tile = Tile(job)
     if job.given is not None:
         x, y, flux, number = job.given
-        tile.stars = Stars(x, y, flux, number=number.astype(int))
+        tile.stars = Stars(x, y, flux, number=number.astype(int),
+                           n_rows=tile.psf.n_rows)
         tile.refresh()
         _warm_up(tile)
     else:
@@ -485,6 +498,7 @@ def _find_all(tile):
 
 
 def _settle(tile):
+    tile.stars.count[:] = 0
     tile.moved = np.zeros(len(tile.stars))
     for _ in range(_FINAL_STEPS):
         tile.moved = tile.step(1e-3)

@@ -15,7 +15,7 @@ from photutils_mgauss import _kernels
 MAX_WING = 60
 # A cell's families are merged if that changes no pixel by more than this
 # fraction of the peak.
-_MERGE_TOLERANCE = 5e-4
+_MERGE_TOLERANCE = 1e-3
 
 
 def _rows(weights, means, covariances):
@@ -71,6 +71,12 @@ class LocalPSF:
             psf._join_families(j, i)
         return psf
 
+    @property
+    def n_rows(self):
+        """The largest number of Gaussians of a star."""
+        k = self.weights.shape[1]
+        return k if self.merged.all() else 4 * k
+
     def moved(self, x, y):
         """Return the PSF with the origin of coordinates at (x, y)."""
         return LocalPSF(self.x_grid - x, self.y_grid - y, self.weights,
@@ -119,7 +125,7 @@ class LocalPSF:
 
         Returns
         -------
-        rows : (n, 4 K, 6) `~numpy.ndarray`
+        rows : (n, n_rows, 6) `~numpy.ndarray`
         count : (n,) `~numpy.ndarray` of int
             How many of the rows are used.
         """
@@ -135,8 +141,7 @@ class LocalPSF:
         n, _, k = weights.shape
         merged = self.merged[j, i]
         count = np.where(merged, k, 4 * k)
-        width = k if merged.all() else 4 * k
-        rows = np.zeros((n, width, 6))
+        rows = np.zeros((n, self.n_rows, 6))
         one = merged
         rows[one, :k] = _merge(weights[one], means[one], covariances[one])
         four = ~merged
