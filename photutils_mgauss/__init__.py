@@ -23,7 +23,9 @@ except ImportError:  # a source tree that was never installed
 # Public name -> the module that owns it.
 _OWNERS = {
     'CrowdedMixturePhotometry': 'crowded',
+    'InjectionResult': 'crowded',
     'UnfinishedTilesError': 'crowded',
+    'inject_and_recover': 'crowded',
     'GriddedMixturePSF': 'gridded',
     'MixtureField': 'field',
     'fit_mixture_field': 'field',

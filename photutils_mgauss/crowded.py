@@ -12,18 +12,22 @@ import warnings
 import numpy as np
 from astropy.nddata import NDData, StdDevUncertainty
 from astropy.stats import mad_std
-from astropy.table import Table
+from astropy.table import QTable, Table, vstack
 from astropy.units import Quantity
 from astropy.utils.exceptions import AstropyUserWarning
 
+from photutils_mgauss import _injection as injection
 from photutils_mgauss import _kernels
 from photutils_mgauss._crowded_table import StarTable, as_qtable, tabulate
 from photutils_mgauss._crowded_tile import TileJob, TileOptions, solve_tile
+from photutils_mgauss._injection import InjectionResult
 from photutils_mgauss._local_psf import LocalPSF
 from photutils_mgauss._parallel import available_cores
-from photutils_mgauss._validation import as_integer, as_real, as_shape
+from photutils_mgauss._validation import (as_floats, as_integer, as_real,
+                                          as_shape)
 
-__all__ = ['CrowdedMixturePhotometry', 'UnfinishedTilesError']
+__all__ = ['CrowdedMixturePhotometry', 'InjectionResult',
+           'UnfinishedTilesError', 'inject_and_recover']
 
 _NAMES = {'x': ('x_init', 'x', 'x_fit', 'x_centroid', 'xcentroid'),
           'y': ('y_init', 'y', 'y_fit', 'y_centroid', 'ycentroid'),
@@ -587,3 +591,136 @@ def _advance(bar, outcomes):
     bar.set_postfix(stars=sum(len(o.stars) for o in done),
                     chi2=f'{chi2:.2f}')
     bar.update()
+
+
+def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
+                       separation=20, radius=0.7, flux_ratio=2.5,
+                       flux_edges=None, effective_gain=1.0, repeats=1,
+                       rng=None):
+    """
+    Add artificial stars to an image and see what is found of them.
+
+    The stars are drawn with the PSF of ``photometry``, with the noise of
+    their own light, on a jittered lattice so wide that they do not crowd one
+    another, and the image is reduced again as before.
+
+    Parameters
+    ----------
+    photometry : CrowdedMixturePhotometry
+        How the image is reduced.
+    data : (ny, nx) array_like
+        The image.
+    flux : (n,) array_like or (low, high) tuple of float
+        The fluxes of the stars of one repeat, or limits between which they
+        are drawn evenly in the logarithm, as many as there is room for.
+    mask, error
+        As in `CrowdedMixturePhotometry.__call__`.
+    separation : float, optional
+        The distance of artificial stars [pix].
+    radius : float, optional
+        How far from its place a star may be found [pix].
+    flux_ratio : float, optional
+        By which factor its flux may be off.
+    flux_edges : (m + 1,) array_like, optional
+        The edges of the bins of flux; by default about a magnitude wide.
+    effective_gain : float, optional
+        Electrons per unit of data, for the noise of the artificial stars.
+    repeats : int, optional
+        How often to do it.
+    rng : `~numpy.random.Generator` or int, optional
+        Randomness, or a seed.
+
+    Returns
+    -------
+    InjectionResult
+        With the tables ``stars`` and ``curves``.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not valid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from photutils_mgauss import (CrowdedMixturePhotometry,
+    ...                               GaussianMixture, GriddedMixturePSF,
+    ...                               inject_and_recover)
+    >>> mixture = GaussianMixture([1], [[0, 0]], [[[0.7, 0], [0, 0.8]]])
+    >>> phot = CrowdedMixturePhotometry(GriddedMixturePSF([mixture],
+    ...                                                   [(0, 0)]))
+    >>> data = np.random.default_rng(1).normal(100, 10, (60, 60))
+    >>> result = inject_and_recover(phot, data, (3000, 9000), rng=2,
+    ...                             error=np.full((60, 60), 10.0))
+    >>> result.curves['completeness']
+    <Column name='completeness' dtype='float64' length=1>
+    1.0
+    """
+    rng = np.random.default_rng(rng)
+    image = _Image.of(data, error, mask)
+    gain = as_real(effective_gain, 'effective_gain', above=0)
+    repeats = as_integer(repeats, 'repeats', minimum=1)
+    separation = as_real(separation, 'separation', minimum=5)
+    before = photometry(data, mask=mask, error=error)
+    known = _positions(before)
+    tables = []
+    for _ in range(repeats):
+        true = _artificial(image, flux, separation, rng)
+        light = _draw(photometry._psf, *true, image.data.shape, None)
+        noisy = rng.poisson(np.maximum(light, 0) * gain) / gain
+        variance = image.variance + light / gain
+        table = photometry(
+            image.data + noisy, mask=image.variance == 0,
+            error=np.sqrt(np.where(image.variance > 0, variance, 1)))
+        row = injection.match(true, _positions(table), known, radius,
+                              flux_ratio)
+        tables.append(_injected(true, table, row))
+    photometry.results = before
+    stars = vstack(tables)
+    if flux_edges is None:
+        flux_edges = _flux_edges(np.asarray(stars['flux_true']))
+    return InjectionResult(stars, injection.curves(stars, flux_edges))
+
+
+def _artificial(image, flux, separation, rng):
+    """Draw x, y and flux of the artificial stars of one repeat."""
+    limits = isinstance(flux, tuple)
+    flux = np.atleast_1d(as_floats(flux, 'flux'))
+    if not (flux > 0).all():
+        msg = f'flux must be positive, got {flux.min()}'
+        raise ValueError(msg)
+    n = image.data.size if limits else flux.size
+    x, y = injection.place_stars(image.data.shape, image.variance == 0, n,
+                                 separation, rng)
+    if limits:
+        flux = np.exp(rng.uniform(*np.log(flux), x.size))
+    elif x.size < flux.size:
+        msg = (f'flux must not hold more stars than fit {separation} pixels '
+               f'apart, {x.size}, got {flux.size}')
+        raise ValueError(msg)
+    return x, y, flux
+
+
+def _positions(table):
+    return tuple(np.asarray(getattr(table[name], 'value', table[name]), float)
+                 for name in ('x_fit', 'y_fit', 'flux_fit'))
+
+
+def _injected(true, table, row):
+    out = QTable(dict(zip(('x_true', 'y_true', 'flux_true'), true,
+                          strict=True)))
+    found = row >= 0
+    out['recovered'] = found
+    for name in ('x_fit', 'y_fit', 'flux_fit', 'x_err', 'y_err', 'flux_err'):
+        column = np.full(row.size, np.nan)
+        values = getattr(table[name], 'value', table[name])
+        column[found] = np.asarray(values, float)[row[found]]
+        out[name] = column
+    out['flags'] = np.zeros(row.size, int)
+    out['flags'][found] = np.asarray(table['flags'])[row[found]]
+    return out
+
+
+def _flux_edges(flux):
+    n = max(1, round(2.5 * np.log10(flux.max() / flux.min())))
+    return np.geomspace(flux.min(), flux.max() * (1 + 1e-9), n + 1)
