@@ -15,8 +15,6 @@ SATURATED, BLENDED, NOT_A_STAR = 1 << 16, 1 << 17, 1 << 18
 _STILL = 0.02
 # Correlation with the nearest neighbour's flux from which a star is a blend.
 _BLEND_CORRELATION = 0.5
-# Neighbours within 4 pix, for each star expected there from its own light.
-_SHATTER = 3.0
 
 
 @dataclass(frozen=True)
@@ -123,6 +121,7 @@ def _flags(tile, quality, error, correlation):
             (NO_CONVERGENCE, tile.moved > _STILL),
             (NO_COVARIANCE, ~np.isfinite(error).all(axis=1)),
             (SATURATED, (quality[:, 5] < 0.5)),
+            (NOT_A_STAR, tile.too_dense(s.x, s.y)),
             (BLENDED, np.abs(correlation) > _BLEND_CORRELATION)):
         flags[where] |= bit
     return flags

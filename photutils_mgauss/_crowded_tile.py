@@ -35,6 +35,8 @@ _WING_NOISE = 0.1
 _PAIR_DISTANCE = 5.0
 # A step of Gauss-Newton moves a star no further than this [pix].
 _MAX_MOVE = 0.4
+# Nor does it change a flux by more than these factors.
+_LEAST_CHANGE, _MOST_CHANGE = 0.2, 2.5
 _CG_STEPS = 60
 # The PSF of a cell of this many pixels serves for finding.
 _CELL = 64
@@ -56,6 +58,11 @@ _FINAL_STEPS = 8
 _CONVERGED = 2e-4
 # Pixels further than this from the model take no part in the background.
 _BACKGROUND_CLIP = 4.0
+# Within this distance [pix], stars are too many to be stars if each has less
+# than this many times the PSF's own area, in which half a star's information
+# lies.
+_DENSITY_REACH = 6.0
+_OWN_AREA = 0.7
 # Groups of bad pixels of up to this many may hide a saturated star.
 _SATURATED_PIXELS = (2, 2000)
 
@@ -185,6 +192,9 @@ class Tile:
         self.noise = 1 / np.sqrt(np.median(self.weight[self.good]))
         ny, nx = self.data.shape
         self.profile = self.psf.profile(nx / 2, ny / 2)
+        stamp = self.psf.stamp(nx / 2, ny / 2, MAX_WING)
+        self.area = stamp.sum()**2 / (stamp**2).sum()
+        self.widths = np.empty(0)
         self._make_mesh()
         self._make_templates()
 
@@ -309,7 +319,8 @@ class Tile:
         move = np.clip(step[:, 1:], -_MAX_MOVE, _MAX_MOVE)
         s.x = s.x + move[:, 0]
         s.y = s.y + move[:, 1]
-        s.flux = np.maximum(s.flux + step[:, 0], 0.2 * s.flux)
+        s.flux = np.clip(s.flux + step[:, 0], _LEAST_CHANGE * s.flux,
+                         _MOST_CHANGE * s.flux)
         self.level = self.level + level_step
         self.refresh()
         return np.abs(move).max(axis=1, initial=0)
@@ -376,7 +387,23 @@ class Tile:
         for places, limit in ((stars, _SEPARATION), (self.graves, _GRAVE)):
             if len(places) and len(found):
                 apart &= cKDTree(places).query(positions)[0] > limit
-        return apart
+        return apart & ~self.too_dense(found.x, found.y)
+
+    def too_dense(self, x, y):
+        """Tell at which positions there are more stars than can be."""
+        s = self.stars
+        if not len(s) or not len(x):
+            return np.zeros(len(x), bool)
+        tree = cKDTree(np.column_stack([s.x, s.y]))
+        count = tree.query_ball_point(np.column_stack([x, y]),
+                                      _DENSITY_REACH, return_length=True)
+        # The part of the circle that is on the tile.
+        ny, nx = self.data.shape
+        part = [np.minimum(v + 0.5, _DENSITY_REACH)
+                + np.minimum(n - 0.5 - v, _DENSITY_REACH)
+                for v, n in ((x, nx), (y, ny))]
+        space = np.pi / 4 * np.prod(np.maximum(part, 1), axis=0)
+        return (count * self.area * _OWN_AREA > space) & (count > 5)
 
     def leave_out(self, threshold):
         """Remove the weakest of each clump of insignificant stars."""
@@ -479,6 +506,10 @@ def _find_all(tile):
         if threshold > options.threshold and tile.find(threshold, number):
             tile.refresh()
             tile.step(1e-2, 0.05)
+            if number == 0:
+                # Later, errors of the PSF are hidden by false companions.
+                tile.step(1e-2, 0.05)
+                tile.widths = _size_differences(tile)
             tile.leave_out(1.0)
             tile.refresh()
     for number in range(options.max_rounds):
@@ -501,7 +532,7 @@ def _settle(tile):
     tile.stars.count[:] = 0
     tile.moved = np.zeros(len(tile.stars))
     for _ in range(_FINAL_STEPS):
-        tile.moved = tile.step(1e-3)
+        tile.moved = tile.step(1e-3, 0.02)
         if np.percentile(tile.moved, 99.5) < _CONVERGED if len(
                 tile.moved) else True:
             break
@@ -528,3 +559,48 @@ def _vertex(image, x, y):
                           out=np.zeros(x.size))
         out.append(np.clip(shift, -0.5, 0.5))
     return out
+
+
+def _size_differences(tile):
+    """
+    Return by how much the PSF's variance is too small at bright stars.
+
+    The Laplacian of a PSF is its derivative by the variance of a Gaussian it
+    is convolved with; its amplitude in the residual is fitted, with star and
+    Laplacian together: a star that is too wide is too bright, too.
+    """
+    s, out = tile.stars, []
+    bright = np.flatnonzero(
+        (s.flux * tile.profile[0] > 50 * tile.noise) & ~s.seeded)
+    ny, nx = tile.data.shape
+    for i in bright[np.argsort(-s.flux[bright])][:200]:
+        w, y, x = tile.width[i], tile.bottom[i], tile.left[i]
+        if x < 0 or y < 0 or x + w > nx or y + w > ny:
+            continue
+        window = slice(y, y + w), slice(x, x + w)
+        stamp = tile.jets[0, tile.offset[i]:tile.offset[i] + w * w]
+        out.append(_size_difference(stamp.reshape(w, w), s.flux[i],
+                                    tile.weight[window],
+                                    tile.residual[window]))
+    return np.array([value for value in out if np.isfinite(value)])
+
+
+def _size_difference(stamp, flux, weight, residual):
+    # A bright star's PSF error is in proportion to its light, whatever the
+    # photon noise: all pixels of the stamp count alike.
+    good = (weight > 0).astype(float)
+    slope = sum(np.gradient(np.gradient(stamp, axis=a), axis=a)
+                for a in (0, 1)) / 2
+    data = residual / flux
+    a = (good * slope * slope).sum()
+    b = (good * slope * stamp).sum()
+    c = (good * stamp * stamp).sum()
+    det = a * c - b * b
+    if not det > 0:
+        return np.nan
+    change = (c * (good * slope * data).sum()
+              - b * (good * stamp * data).sum()) / det
+    j, k = np.indices(stamp.shape) - len(stamp) // 2
+    core = (j**2 + k**2) <= 9
+    size = (stamp * core * (j**2 + k**2)).sum() / (2 * (stamp * core).sum())
+    return change / size

@@ -3232,10 +3232,10 @@ def star_quality(flux, x, y, left, bottom, width, offset, jets, weight,
             row = bottom[i] + j
             for k in range(w):
                 column = left[i] + k
-                p = jets[0, offset[i] + j * w + k]
-                power += p * p
                 if not (0 <= row < ny and 0 <= column < nx):
                     continue
+                p = jets[0, offset[i] + j * w + k]
+                power += p * p
                 v = weight[row, column]
                 if v == 0:
                     continue

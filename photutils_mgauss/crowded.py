@@ -147,7 +147,7 @@ class CrowdedMixturePhotometry:
     True
     """
 
-    def __init__(self, psf_model, *, threshold=5.0, keep=3.5,
+    def __init__(self, psf_model, *, threshold=4.5, keep=2.5,
                  background_size=64, psf_error=0.01, effective_gain=None,
                  maxiters=8, tile_shape=512, overlap=48, executor=None,
                  progress_bar=False):
@@ -222,7 +222,7 @@ class CrowdedMixturePhotometry:
                                              stars.columns['y_fit'])))
         self.results = as_qtable(stars, image.unit, meta)
         if len(done) < len(jobs):
-            unfinished = [job.core for job, outcome in zip(
+            unfinished = [_clipped(job.core, image.data.shape) for job, outcome in zip(
                 jobs, outcomes, strict=True) if outcome is None]
             raise UnfinishedTilesError(unfinished, self.results) from next(
                 e for e in self._errors)
@@ -356,37 +356,7 @@ def _work(job):
     tile = solve_tile(job)
     chi = tile.weight * tile.residual**2
     return _Outcome(tabulate(tile, job.core), float(chi.sum()),
-                    int(tile.good.sum()), _size_differences(tile))
-
-
-def _size_differences(tile):
-    """
-    Return by how much the PSF's variance is too small at bright stars.
-
-    The Laplacian of a PSF is its derivative by the variance of a Gaussian it
-    is convolved with; its amplitude in the residual is fitted.
-    """
-    s, out = tile.stars, []
-    bright = np.flatnonzero(
-        (s.flux * tile.profile[0] > 50 * tile.noise) & ~s.seeded)
-    for i in bright[np.argsort(-s.flux[bright])][:200]:
-        w, y, x = tile.width[i], tile.bottom[i], tile.left[i]
-        if x < 0 or y < 0 or x + w > tile.data.shape[1] or (
-                y + w > tile.data.shape[0]):
-            continue
-        stamp = tile.jets[0, tile.offset[i]:tile.offset[i] + w * w]
-        stamp = stamp.reshape(w, w)
-        slope = sum(np.gradient(np.gradient(stamp, axis=a), axis=a)
-                    for a in (0, 1)) * s.flux[i] / 2
-        weight = tile.weight[y:y + w, x:x + w]
-        residual = tile.residual[y:y + w, x:x + w]
-        j, k = np.indices(stamp.shape)
-        size = (stamp * ((j - w // 2)**2 + (k - w // 2)**2)).sum() / (
-            2 * stamp.sum())
-        norm = (weight * slope**2).sum()
-        if norm > 0 and size > 0:
-            out.append((weight * slope * residual).sum() / norm / size)
-    return np.array(out)
+                    int(tile.good.sum()), tile.widths)
 
 
 @dataclass(frozen=True)
@@ -498,9 +468,9 @@ def _job(image, psf, options, core, overlap, given):
     x_low, x_high = max(0, core[2] - overlap), min(nx, core[3] + overlap)
     window = slice(y_low, y_high), slice(x_low, x_high)
     # The outermost tiles also own the stars just outside the image.
-    core = (core[0] if core[0] else -overlap,
+    core = (core[0] or -overlap,
             core[1] if core[1] < ny else ny + overlap,
-            core[2] if core[2] else -overlap,
+            core[2] or -overlap,
             core[3] if core[3] < nx else nx + overlap)
     part = None
     if given is not None:
@@ -513,6 +483,11 @@ def _job(image, psf, options, core, overlap, given):
                    np.ascontiguousarray(image.variance[window]),
                    psf.moved(x_low, y_low), options, (y_low, x_low), core,
                    part)
+
+
+def _clipped(core, shape):
+    y, x = np.clip(core[:2], 0, shape[0]), np.clip(core[2:], 0, shape[1])
+    return tuple(int(v) for v in (*y, *x))
 
 
 def _given(table):
