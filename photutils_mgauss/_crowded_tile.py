@@ -54,8 +54,10 @@ _SEPARATION = 0.3
 _GRAVE = 0.5
 # Finding starts with the brightest stars.
 _FALLING = (80, 25, 10)
-_FINAL_STEPS = 8
+_FINAL_STEPS = 12
 _CONVERGED = 2e-4
+# A step smaller than this, in pixels and in standard errors, is not taken.
+_REST = 2e-5
 # Pixels further than this from the model take no part in the background.
 _BACKGROUND_CLIP = 4.0
 # Within this distance [pix], stars are too many to be stars if each has less
@@ -245,17 +247,40 @@ class Tile:
 
     def draw(self):
         """Evaluate all stamps, the residual and the weights."""
-        s = self.stars
-        everyone = np.arange(len(s))
+        everyone = np.arange(len(self.stars))
         self._localise_psf()
-        psf = (s.rows, s.count, self.psf.integrated)
-        _kernels.star_stamps(everyone, s.x, s.y, *self._place(), *psf,
-                             self.jets)
+        self._draw_stamps(everyone)
         self.residual = self.data.copy()
-        _kernels.add_background(self.level, self.mesh_x, self.mesh_y, -1.0,
+        self._add_background(-1.0)
+        self._add_stars(everyone, -1.0)
+        self._weigh()
+
+    def redraw(self, changed, change):
+        """Let a function change some stars, and the level; stay up to date."""
+        self._add_stars(changed, 1.0)
+        self._add_background(1.0)
+        change()
+        self._draw_stamps(changed)
+        self._add_background(-1.0)
+        self._add_stars(changed, -1.0)
+        self._weigh()
+
+    def _draw_stamps(self, chosen):
+        s = self.stars
+        _kernels.star_stamps(chosen, s.x, s.y, *self._place(), s.rows,
+                             s.count, self.psf.integrated, self.jets)
+
+    def _add_stars(self, chosen, sign):
+        s = self.stars
+        _kernels.add_stars(chosen, sign, s.x, s.y, s.flux, *self._place(),
+                           self.wing, self.jets, s.rows, s.count,
+                           self.psf.integrated, self.residual)
+
+    def _add_background(self, sign):
+        _kernels.add_background(self.level, self.mesh_x, self.mesh_y, sign,
                                 self.residual)
-        _kernels.add_stars(everyone, -1.0, s.x, s.y, s.flux, *self._place(),
-                           self.wing, self.jets, *psf, self.residual)
+
+    def _weigh(self):
         if self.options.gain is not None:
             # The photon noise of the model, not that of the data.
             variance = self.variance - self.residual / self.options.gain
@@ -306,8 +331,8 @@ class Tile:
         self.draw()
         self.form_equations()
 
-    def step(self, tolerance, damping=0.0):
-        """Take one Gauss-Newton step; return how far each star moved."""
+    def _solve(self, tolerance, damping):
+        """Return the Gauss-Newton step of the stars and of the level."""
         s, p = self.stars, self.pairs
         step = np.empty((len(s), 3))
         level_step = np.empty(self.level.size)
@@ -316,14 +341,42 @@ class Tile:
             matrix, self.gradient, p.indptr, p.neighbour, self.blocks,
             *self._shares(), self.reach, self.mesh, self.mesh_gradient,
             tolerance, _CG_STEPS, step, level_step)
-        move = np.clip(step[:, 1:], -_MAX_MOVE, _MAX_MOVE)
-        s.x = s.x + move[:, 0]
-        s.y = s.y + move[:, 1]
-        s.flux = np.clip(s.flux + step[:, 0], _LEAST_CHANGE * s.flux,
-                         _MOST_CHANGE * s.flux)
+        step[:, 1:] = np.clip(step[:, 1:], -_MAX_MOVE, _MAX_MOVE)
+        step[:, 0] = np.clip(step[:, 0], (_LEAST_CHANGE - 1) * s.flux,
+                             (_MOST_CHANGE - 1) * s.flux)
+        return step, level_step
+
+    def _take(self, step, level_step):
+        s = self.stars
+        s.flux = s.flux + step[:, 0]
+        s.x = s.x + step[:, 1]
+        s.y = s.y + step[:, 2]
         self.level = self.level + level_step
+
+    def step(self, tolerance, damping=0.0):
+        """Take one Gauss-Newton step; return how far each star moved."""
+        step, level_step = self._solve(tolerance, damping)
+        self._take(step, level_step)
         self.refresh()
-        return np.abs(move).max(axis=1, initial=0)
+        return np.abs(step[:, 1:]).max(axis=1, initial=0)
+
+    def polish(self, tolerance, damping):
+        """
+        Take a step without a new layout; return how far each star moved.
+
+        Stamps stay where they are, so that steps converge; stars that are
+        at rest stay as they are.
+        """
+        step, level_step = self._solve(tolerance, damping)
+        moved = np.abs(step[:, 1:]).max(axis=1, initial=0)
+        restless = moved > _REST
+        restless |= (np.abs(step[:, 0]) * np.sqrt(self.matrix[:, 0, 0])
+                     > _REST)
+        step[~restless] = 0
+        self.redraw(np.flatnonzero(restless),
+                    lambda: self._take(step, level_step))
+        self.form_equations()
+        return moved
 
     def _shares(self):
         """Return each star's four nodes of the background and shares."""
@@ -485,7 +538,6 @@ def solve_tile(job):
         x, y, flux, number = job.given
         tile.stars = Stars(x, y, flux, number=number.astype(int),
                            n_rows=tile.psf.n_rows)
-        tile.refresh()
         _warm_up(tile)
     else:
         tile.seed_saturated()
@@ -496,6 +548,15 @@ def solve_tile(job):
 
 
 def _warm_up(tile):
+    """Bring given stars, perhaps without fluxes, near their solution."""
+    s = tile.stars
+    ny, nx = tile.data.shape
+    unknown = ~(s.flux > 0)
+    x = np.clip(np.rint(s.x), 0, nx - 1).astype(int)
+    y = np.clip(np.rint(s.y), 0, ny - 1).astype(int)
+    peak = np.maximum(tile.data[y, x] - tile.level.min(), tile.noise)
+    s.flux = np.where(unknown, peak / tile.profile[0], s.flux)
+    tile.refresh()
     for damping in (1.0, 0.3, 0.1, 0.03):
         tile.step(1e-2, damping)
 
@@ -524,18 +585,22 @@ def _find_all(tile):
         else:
             gone = tile.leave_out(0.7 * options.keep)
         tile.refresh()
-        if new <= 0.003 * len(tile.stars):
+        if new <= 0.005 * len(tile.stars):
             break
 
 
 def _settle(tile):
     tile.stars.count[:] = 0
+    tile.refresh()
     tile.moved = np.zeros(len(tile.stars))
-    for _ in range(_FINAL_STEPS):
-        tile.moved = tile.step(1e-3, 0.02)
-        if np.percentile(tile.moved, 99.5) < _CONVERGED if len(
-                tile.moved) else True:
+    for number in range(_FINAL_STEPS if len(tile.stars) else 1):
+        tile.moved = tile.polish(1e-4, 0.02 if number < 2 else 0.0)
+        if not (tile.moved > _CONVERGED).sum() > 0.005 * len(tile.stars):
             break
+    far = ((np.abs(tile.stars.x - tile.left - tile.width // 2) > 1.5)
+           | (np.abs(tile.stars.y - tile.bottom - tile.width // 2) > 1.5))
+    if far.any():
+        tile.refresh()
 
 
 def _lattice(first, size, spacing):

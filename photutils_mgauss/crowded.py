@@ -149,7 +149,7 @@ class CrowdedMixturePhotometry:
 
     def __init__(self, psf_model, *, threshold=4.5, keep=2.5,
                  background_size=64, psf_error=0.01, effective_gain=None,
-                 maxiters=8, tile_shape=512, overlap=48, executor=None,
+                 maxiters=4, tile_shape=512, overlap=48, executor=None,
                  progress_bar=False):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
@@ -272,7 +272,9 @@ class CrowdedMixturePhotometry:
         widths = np.concatenate([o.widths for o in done]) if done else []
         n_pixels = sum(o.n_pixels for o in done)
         chi2 = sum(o.chi2 for o in done) / max(n_pixels, 1)
-        width = float(np.median(widths)) if len(widths) >= 5 else np.nan
+        # Undetected companions broaden stars: look at those least broadened.
+        width = (float(np.percentile(widths, 25)) if len(widths) >= 5
+                 else np.nan)
         if abs(width) > _WIDTH_TOLERANCE:
             word = 'narrow' if width > 0 else 'wide'
             warnings.warn(f'the PSF is too {word}: the variance of the light '

@@ -136,7 +136,7 @@ def test_neighbours_are_listed_both_ways():
 
 
 def test_merged_gaussians_are_the_blend_of_the_grid():
-    shapes = [0.6, 0.63, 0.61, 0.66]
+    shapes = [0.6, 0.61, 0.605, 0.62]
     nodes = [GaussianMixture([0.7 + i / 100, 0.3 - i / 100],
                              [[0.01 * i, 0], [0, 0]],
                              [[[s, 0], [0, s]], [[3, 0], [0, 3 + s]]])
