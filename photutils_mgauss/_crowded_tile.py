@@ -60,6 +60,8 @@ _CONVERGED = 2e-4
 _REST = 2e-5
 # Pixels further than this from the model take no part in the background.
 _BACKGROUND_CLIP = 4.0
+# How strongly neighbouring nodes are tied, in units of a node's information.
+_TIE = 1e-3
 # Within this distance [pix], stars are too many to be stars if each has less
 # than this many times the PSF's own area, in which half a star's information
 # lies.
@@ -206,6 +208,7 @@ class Tile:
         y_0, x_0 = self.origin
         self.mesh_x = _lattice(x_0, nx, size) - x_0
         self.mesh_y = _lattice(y_0, ny, size) - y_0
+        self.ties = _ties(self.mesh_y.size, self.mesh_x.size)
         start = 0.0
         if self.options.background_size:
             # Stars hide the sky.
@@ -310,20 +313,24 @@ class Tile:
         self.matrix = np.empty((n, 3, 3))
         self.gradient, self.reach = np.empty((n, 3)), np.empty((n, 3))
         self.blocks = np.empty((p.neighbour.size, 3, 3))
-        self.mesh, self.mesh_gradient = np.zeros((m, m)), np.zeros(m)
+        self.mesh_gradient = np.zeros(m)
         place = (*self._place(), self.jets)
         _kernels.star_equations(s.flux, *place, self.weight, self.residual,
                                 self.matrix, self.gradient, self.reach)
         _kernels.pair_blocks(p.indptr, p.neighbour, p.twin, s.flux, *place,
                              self.weight, self.blocks)
+        information = np.zeros(m)
         if self.options.background_size:
             _kernels.background_equations(
-                self.residual, self.weight, self.mesh_x, self.mesh_y,
-                _BACKGROUND_CLIP, self.mesh, self.mesh_gradient)
+                self.residual, self.weight, self.level, self.mesh_x,
+                self.mesh_y, _BACKGROUND_CLIP, information,
+                self.mesh_gradient)
         else:
             self.reach[:] = 0
-        # Nodes without data stay where they are.
-        self.mesh[np.diag_indices(m)] += 1e-6 / self.noise**2
+        # Nodes without pixels follow their neighbours.
+        tie = _TIE * max(np.median(information), 1e-6 / self.noise**2)
+        self.mesh = np.diag(information) + tie * self.ties
+        self.mesh_gradient -= tie * self.ties @ self.level
 
     def refresh(self):
         """Bring everything up to date with the stars."""
@@ -604,10 +611,23 @@ def _settle(tile):
 
 
 def _lattice(first, size, spacing):
-    """Return the multiples of spacing whose cells cover the pixels."""
-    low = np.floor(first / spacing)
-    high = max(np.ceil((first + size - 1) / spacing), low + 1)
+    """Return the multiples of spacing that are nearest to a pixel."""
+    low = np.rint(first / spacing)
+    high = max(np.rint((first + size - 1) / spacing), low + 1)
     return np.arange(low, high + 1) * float(spacing)
+
+
+def _ties(ny, nx):
+    """Return the matrix of the sum of squared differences of neighbours."""
+    number = np.arange(ny * nx).reshape(ny, nx)
+    out = np.zeros((ny * nx, ny * nx))
+    for a, b in ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1])):
+        a, b = a.ravel(), b.ravel()
+        np.add.at(out, (a, a), 1)
+        np.add.at(out, (b, b), 1)
+        out[a, b] -= 1
+        out[b, a] -= 1
+    return out
 
 
 def _vertex(image, x, y):

@@ -3016,30 +3016,36 @@ def score(residual, weight, template, x_low, x_high, y_low, y_high, hint,
 
 
 @_jit
-def background_equations(residual, weight, x_grid, y_grid, limit, mesh,
-                         gradient):
+def background_equations(residual, weight, level, x_grid, y_grid, limit,
+                         information, gradient):
     """
-    Put the normal equations of a bilinear background into mesh, gradient.
+    Put the information on each node of the background, and gradients.
 
-    Its nodes are ordered by y, then x. Pixels further than limit standard
-    errors from the model take no part.
+    A node, ordered by y, then x, is the mean of the sky over the pixels
+    nearest to it, so that it depends on nothing further away. Pixels more
+    than limit standard errors from the model take no part.
     """
     index = np.empty(4, np.int64)
     share = np.empty((3, 4))
-    mesh[:] = 0
+    information[:] = 0
     gradient[:] = 0
     for y in range(residual.shape[0]):
         for x in range(residual.shape[1]):
             w = weight[y, x]
             r = residual[y, x]
-            if w * r * r > limit * limit or w == 0:
+            if w == 0:
                 continue
             blend_weights(float(x), float(y), x_grid, y_grid, index, share)
+            here = 0.0
+            node = 0
             for a in range(4):
-                gradient[index[a]] += w * r * share[0, a]
-                for b in range(4):
-                    mesh[index[a], index[b]] += (w * share[0, a]
-                                                 * share[0, b])
+                here += share[0, a] * level[index[a]]
+                if share[0, a] > share[0, node]:
+                    node = a
+            # All pixels count here: stars are coupled through all of theirs.
+            information[index[node]] += w
+            if w * r * r <= limit * limit:
+                gradient[index[node]] += w * (r + here - level[index[node]])
 
 
 @_jit

@@ -466,8 +466,9 @@ def _cores(shape, tile_shape):
 
 def _job(image, psf, options, core, overlap, given):
     ny, nx = image.data.shape
-    y_low, y_high = max(0, core[0] - overlap), min(ny, core[1] + overlap)
-    x_low, x_high = max(0, core[2] - overlap), min(nx, core[3] + overlap)
+    margin = options.background_size or 0
+    y_low, y_high = _window(core[:2], ny, overlap, margin)
+    x_low, x_high = _window(core[2:], nx, overlap, margin)
     window = slice(y_low, y_high), slice(x_low, x_high)
     # The outermost tiles also own the stars just outside the image.
     core = (core[0] or -overlap,
@@ -485,6 +486,19 @@ def _job(image, psf, options, core, overlap, given):
                    np.ascontiguousarray(image.variance[window]),
                    psf.moved(x_low, y_low), options, (y_low, x_low), core,
                    part)
+
+
+def _window(core, size, overlap, spacing):
+    """
+    Return which pixels a tile sees along an axis.
+
+    It sees all of those that the background nodes around its core rest on.
+    """
+    low, high = core[0] - overlap, core[1] + overlap
+    if spacing:
+        low = min(low, (core[0] // spacing - 0.5) * spacing)
+        high = max(high, (-(-core[1] // spacing) + 0.5) * spacing)
+    return max(0, int(np.floor(low))), min(size, int(np.ceil(high)) + 1)
 
 
 def _clipped(core, shape):

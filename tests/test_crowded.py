@@ -192,7 +192,7 @@ def test_tiles_do_not_change_a_star(crowd, fitted):
     table = photometry(tile_shape=(70, 64))(crowd[0], error=crowd[1])
     distance, row = nearest(table, fitted['x_fit'], fitted['y_fit'])
     assert len(table) == pytest.approx(len(fitted), abs=4)
-    assert (distance < 1e-3).mean() > 0.9
+    assert (distance < 1e-3).mean() > 0.95
     sigma = distance / np.hypot(fitted['x_err'], fitted['y_err'])
     assert np.percentile(sigma, 97) < 0.1
 
@@ -261,7 +261,8 @@ def test_a_galaxy_is_flagged_if_it_is_taken_for_stars():
     data, error = expose(20 + galaxy, 4)
     table = photometry()(data, error=error)
     assert len(table) < 500
-    assert (table['flags'] & 262144 > 0).sum() > 0.5 * len(table)
+    flagged = table['flags'] & (262144 | 8) > 0
+    assert flagged.sum() > 0.6 * len(table)
 
 
 @pytest.mark.parametrize(('factor', 'word'), [(1.8, 'wide'), (0.5, 'narrow')])
