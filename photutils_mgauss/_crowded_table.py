@@ -64,12 +64,12 @@ def tabulate(tile, core):
     covariance = covariance * _confusion(tile, quality)[:, None, None]
     with np.errstate(invalid='ignore'):
         error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    count, chi2, deviation, centre, crowding, seen = quality.T
+    count, chi2, deviation, centre, crowding, _ = quality.T
     node, share = tile._shares()
     flux = np.maximum(s.flux, 1e-300)
     strength = np.divide(s.flux, error[:, 0], where=error[:, 0] > 0,
                          out=np.zeros(len(s)))
-    columns = dict(
+    columns = dict(  # noqa: C408
         number=s.number, local_bkg=(tile.level[node] * share).sum(axis=1),
         x_init=s.x_init + x_0, y_init=s.y_init + y_0, flux_init=s.flux_init,
         x_fit=s.x + x_0, y_fit=s.y + y_0, flux_fit=s.flux,

@@ -20,6 +20,7 @@ from scipy.ndimage import label, maximum_filter
 from scipy.spatial import cKDTree
 
 from photutils_mgauss import _kernels
+from photutils_mgauss._crowded_stars import Neighbours, Stars
 from photutils_mgauss._local_psf import MAX_WING, cells
 
 # Fit stamps are 7 or 9 pixels wide, 13 for bright stars: almost all of the
@@ -30,9 +31,6 @@ _BRIGHT_FLUX = 300
 # A star is drawn out to where its surface brightness falls below this
 # fraction of the noise.
 _WING_NOISE = 0.1
-# Stars further apart than this are not solved for together [pix]; they still
-# see each other through the residual.
-_PAIR_DISTANCE = 5.0
 # A step of Gauss-Newton moves a star no further than this [pix].
 _MAX_MOVE = 0.4
 # Nor does it change a flux by more than these factors.
@@ -101,82 +99,6 @@ class TileJob:
     origin: tuple
     core: tuple
     given: np.ndarray | None = None
-
-
-class Stars:
-    """The stars of a tile, as parallel arrays."""
-
-    COLUMNS = ('x', 'y', 'flux', 'x_init', 'y_init', 'flux_init',
-               'significance', 'round', 'number', 'seeded', 'rows', 'count')
-
-    def __init__(self, x, y, flux, *, significance=0, found_in=0, number=-1,
-                 seeded=False, n_rows=0):
-        n = len(x)
-        self.x, self.y, self.flux = (np.array(v, float) for v in (x, y, flux))
-        self.x_init, self.y_init = self.x.copy(), self.y.copy()
-        self.flux_init = self.flux.copy()
-        self.significance = np.zeros(n) + significance
-        self.round = np.zeros(n, int) + found_in
-        self.number = np.zeros(n, int) + number
-        self.seeded = np.zeros(n, bool) | seeded
-        # The Gaussians of each star's PSF, filled in when it is drawn.
-        self.rows = np.empty((n, n_rows, 6))
-        self.count = np.zeros(n, int)
-
-    def __len__(self):
-        return self.x.size
-
-    def select(self, chosen):
-        """Keep the chosen stars only."""
-        for name in self.COLUMNS:
-            setattr(self, name, getattr(self, name)[chosen])
-
-    def append(self, other):
-        """Add stars."""
-        for name in self.COLUMNS:
-            setattr(self, name, np.concatenate([getattr(self, name),
-                                                getattr(other, name)]))
-
-
-@dataclass(frozen=True)
-class Neighbours:
-    """
-    Who overlaps whom: rows of a sparse matrix, nearest first.
-
-    Star i's neighbours are neighbour[indptr[i]:indptr[i + 1]], twin is where
-    the same pair stands the other way round; owner is i for each of them.
-    """
-
-    indptr: np.ndarray
-    neighbour: np.ndarray
-    twin: np.ndarray
-    owner: np.ndarray
-    nearest: np.ndarray
-    distance: np.ndarray
-
-    @classmethod
-    def of(cls, x, y):
-        """List the pairs of stars that are solved for together."""
-        n = x.size
-        pairs = np.empty((0, 2), int)
-        if n > 1:
-            pairs = cKDTree(np.column_stack([x, y])).query_pairs(
-                _PAIR_DISTANCE, output_type='ndarray')
-        i = np.concatenate([pairs[:, 0], pairs[:, 1]])
-        j = np.concatenate([pairs[:, 1], pairs[:, 0]])
-        gap = np.hypot(x[i] - x[j], y[i] - y[j])
-        order = np.lexsort((j, gap, i))
-        place = np.empty(i.size, np.int64)
-        place[order] = np.arange(i.size)
-        twin = place[np.roll(np.arange(i.size), len(pairs))][order]
-        i, j, gap = i[order], j[order], gap[order]
-        indptr = np.searchsorted(i, np.arange(n + 1))
-        has = indptr[1:] > indptr[:-1]
-        nearest, distance = np.full(n, -1), np.full(n, np.inf)
-        nearest[has] = j[indptr[:-1][has]]
-        distance[has] = gap[indptr[:-1][has]]
-        return cls(indptr.astype(np.int64), j.astype(np.int64), twin, i,
-                   nearest, distance)
 
 
 class Tile:
@@ -621,8 +543,9 @@ def _ties(ny, nx):
     """Return the matrix of the sum of squared differences of neighbours."""
     number = np.arange(ny * nx).reshape(ny, nx)
     out = np.zeros((ny * nx, ny * nx))
-    for a, b in ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1])):
-        a, b = a.ravel(), b.ravel()
+    pairs = ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1]))
+    for after, before in pairs:
+        a, b = after.ravel(), before.ravel()
         np.add.at(out, (a, a), 1)
         np.add.at(out, (b, b), 1)
         out[a, b] -= 1

@@ -1,5 +1,6 @@
 """Artificial stars: completeness and errors as functions of flux."""
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from astropy.table import QTable
@@ -89,7 +90,7 @@ def curves(stars, edges):
     """Return completeness and errors per bin of true flux."""
     flux = np.asarray(stars['flux_true'])
     out = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges):
         here = (flux >= low) & (flux < high)
         good = here & stars['recovered']
         dx = np.concatenate([(stars[f'{c}_fit'] - stars[f'{c}_true'])[good]

@@ -3129,7 +3129,7 @@ def score_beside(x, y, flux, left, bottom, width, offset, jets, matrix,
     where v is the variance of g by errors of the PSF, the sum over pixels of
     :math:`(t w\,\mathrm{light})^2`. Pixels where less than the fraction
     least of h is left cannot be told from the stars and keep 0. templates is
-    (cells along y, along x, 2h + 1, 2h + 1), each serving cell x cell pixels.
+    (cells along y, along x, 2h + 1, 2h + 1), each for cell x cell pixels.
     """
     ny, nx = residual.shape
     most = 4

@@ -5,26 +5,29 @@ Every star is fitted with its neighbours free, in an image of which all other
 stars are subtracted, as Sec. 5 of Nie et al. asks of a method for the
 Galactic bulge.
 """
+import warnings
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
-import warnings
 
 import numpy as np
-from astropy.nddata import NDData, StdDevUncertainty
-from astropy.stats import mad_std
+from astropy.nddata import NDData
 from astropy.table import QTable, Table, vstack
-from astropy.units import Quantity
 from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss import _injection as injection
 from photutils_mgauss import _kernels
+from photutils_mgauss._crowded_image import Image, find_gain
 from photutils_mgauss._crowded_table import StarTable, as_qtable, tabulate
 from photutils_mgauss._crowded_tile import TileJob, TileOptions, solve_tile
 from photutils_mgauss._injection import InjectionResult
 from photutils_mgauss._local_psf import LocalPSF
 from photutils_mgauss._parallel import available_cores
-from photutils_mgauss._validation import (as_floats, as_integer, as_real,
-                                          as_shape)
+from photutils_mgauss._validation import (
+    as_floats,
+    as_integer,
+    as_real,
+    as_shape,
+)
 
 __all__ = ['CrowdedMixturePhotometry', 'InjectionResult',
            'UnfinishedTilesError', 'inject_and_recover']
@@ -203,7 +206,7 @@ class CrowdedMixturePhotometry:
         UnfinishedTilesError
             If a worker failed; the finished tiles are in the error.
         """
-        image = _Image.of(data, error, mask)
+        image = Image.of(data, error, mask)
         self._image = image
         given = None if init_params is None else _given(init_params)
         options = self._options(image)
@@ -222,8 +225,9 @@ class CrowdedMixturePhotometry:
                                              stars.columns['y_fit'])))
         self.results = as_qtable(stars, image.unit, meta)
         if len(done) < len(jobs):
-            unfinished = [_clipped(job.core, image.data.shape) for job, outcome in zip(
-                jobs, outcomes, strict=True) if outcome is None]
+            unfinished = [_clipped(job.core, image.data.shape)
+                          for job, outcome in zip(jobs, outcomes, strict=True)
+                          if outcome is None]
             raise UnfinishedTilesError(unfinished, self.results) from next(
                 e for e in self._errors)
         return self.results
@@ -231,7 +235,7 @@ class CrowdedMixturePhotometry:
     def _options(self, image):
         gain = self.effective_gain
         if gain is None:
-            gain = _find_gain(image)
+            gain = find_gain(image)
         good = image.variance > 0
         floor = image.variance[good].min() if good.any() else 1.0
         return TileOptions(
@@ -260,7 +264,7 @@ class CrowdedMixturePhotometry:
         for future in as_completed(futures):
             try:
                 outcomes[futures[future]] = future.result()
-            except Exception as error:
+            except Exception as error:  # noqa: BLE001 a worker may die of any
                 self._errors.append(error)
             if bar is not None:
                 _advance(bar, outcomes)
@@ -359,84 +363,6 @@ def _work(job):
     chi = tile.weight * tile.residual**2
     return _Outcome(tabulate(tile, job.core), float(chi.sum()),
                     int(tile.good.sum()), tile.widths)
-
-
-@dataclass(frozen=True)
-class _Image:
-    data: np.ndarray
-    variance: np.ndarray
-    unit: object
-
-    @classmethod
-    def of(cls, data, error, mask):
-        if isinstance(data, NDData):
-            return cls._of_nddata(data, error, mask)
-        unit = data.unit if isinstance(data, Quantity) else None
-        if isinstance(error, Quantity):
-            error = error.to_value(unit) if unit is not None else error
-        values = _plane(getattr(data, 'value', data), 'data')
-        good = np.isfinite(values)
-        if mask is not None:
-            good &= ~_plane(mask, 'mask', values.shape).astype(bool)
-        if error is None:
-            error = np.full(values.shape, _estimate_noise(values[good]))
-        error = _plane(error, 'error', values.shape)
-        good &= np.isfinite(error) & (error > 0)
-        return cls(np.where(good, values, 0.0),
-                   np.where(good, error, 0.0)**2, unit)
-
-    @classmethod
-    def _of_nddata(cls, data, error, mask):
-        values = data.data if data.unit is None else data.data * data.unit
-        if mask is None:
-            mask = data.mask
-        if error is None and data.uncertainty is not None:
-            error = data.uncertainty.represent_as(StdDevUncertainty).array
-        return cls.of(values, error, mask)
-
-
-def _plane(value, name, shape=None):
-    value = np.asarray(getattr(value, 'value', value))
-    if value.dtype.kind not in 'buif':
-        msg = f'{name} must be an array of numbers, got {value.dtype}'
-        raise TypeError(msg)
-    if value.ndim != 2 or (shape is not None and value.shape != shape):
-        want = '(ny, nx)' if shape is None else f'that of data, {shape}'
-        msg = f'{name} must have the shape {want}, got {value.shape}'
-        raise ValueError(msg)
-    return value.astype(float)
-
-
-def _estimate_noise(values):
-    """Return the scatter of the faint half of the pixels."""
-    if values.size == 0:
-        return 1.0
-    level = np.median(values)
-    low = values[values <= level]
-    # Stars only brighten pixels: mirror the faint half.
-    noise = mad_std(np.concatenate([low, 2 * level - low]))
-    return noise if noise > 0 else max(values.std(), 1.0)
-
-
-def _find_gain(image):
-    """
-    Return the gain that ties variance to data, None if nothing does.
-
-    An error map made from the data itself is a straight line over it.
-    """
-    good = image.variance > 0
-    data, variance = image.data[good], image.variance[good]
-    step = max(1, data.size // 20000)
-    data, variance = data[::step], variance[::step]
-    bright = data > np.median(data) if data.size else np.array([], bool)
-    data, variance = data[bright], variance[bright]
-    if data.size < 50 or np.ptp(data) == 0:
-        return None
-    slope, start = np.polyfit(data, variance, 1)
-    apart = np.abs(variance - start - slope * data)
-    if slope <= 0 or np.percentile(apart, 90) > 0.02 * slope * data.std():
-        return None
-    return 1 / slope
 
 
 def _local_psf(model):
@@ -648,7 +574,7 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     1.0
     """
     rng = np.random.default_rng(rng)
-    image = _Image.of(data, error, mask)
+    image = Image.of(data, error, mask)
     gain = as_real(effective_gain, 'effective_gain', above=0)
     repeats = as_integer(repeats, 'repeats', minimum=1)
     separation = as_real(separation, 'separation', minimum=5)
