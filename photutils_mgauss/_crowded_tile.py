@@ -268,7 +268,7 @@ class Tile:
         matrix = self.matrix * (1 + damping * np.eye(3))
         _kernels.solve_joint(
             matrix, self.gradient, p.indptr, p.neighbour, self.blocks,
-            *self._shares(), self.reach, self.mesh, self.mesh_gradient,
+            *self._own_node(), self.reach, self.mesh, self.mesh_gradient,
             tolerance, _CG_STEPS, step, level_step)
         step[:, 1:] = np.clip(step[:, 1:], -_MAX_MOVE, _MAX_MOVE)
         step[:, 0] = np.clip(step[:, 0], (_LEAST_CHANGE - 1) * s.flux,
@@ -306,6 +306,15 @@ class Tile:
                     lambda: self._take(step, level_step))
         self.form_equations()
         return moved
+
+    def _own_node(self):
+        """Return the shares of a background that is constant in cells."""
+        # Only such a one makes, with each node's own mean, a matrix that is
+        # positive definite; where steps end does not depend on it.
+        node, share = self._shares()
+        own = np.zeros(share.shape)
+        own[np.arange(len(own)), share.argmax(axis=1)] = 1
+        return node, own
 
     def _shares(self):
         """Return each star's four nodes of the background and shares."""

@@ -2827,8 +2827,8 @@ def solve_joint(matrix, gradient, indptr, neighbour, blocks, node, share,
 
     Stars couple to their neighbours (`pair_blocks`) and to the four nodes
     node (n, 4) of the background around them, with the bilinear shares
-    share (n, 4); mesh (m, m) is the background's own matrix. The preconditioner
-    inverts each star's own block. Returns the number of steps.
+    share (n, 4); mesh (m, m) is the background's own matrix. Each star's own
+    block is the preconditioner. Returns the number of steps.
     """
     n = gradient.shape[0]
     inverse = np.empty((n, 3, 3))
