@@ -52,8 +52,11 @@ _SEPARATION = 0.3
 _GRAVE = 0.5
 # Finding starts with the brightest stars.
 _FALLING = (80, 25, 10)
-_FINAL_STEPS = 12
+_FINAL_STEPS = 8
 _CONVERGED = 2e-4
+# Polishing moves no star further than this [pix]: blends that cannot be
+# resolved would run away.
+_ROAM = 0.5
 # A step smaller than this, in pixels and in standard errors, is not taken.
 _REST = 2e-5
 # Pixels further than this from the model take no part in the background.
@@ -298,6 +301,7 @@ class Tile:
         """
         step, level_step = self._solve(tolerance, damping)
         moved = np.abs(step[:, 1:]).max(axis=1, initial=0)
+        self._rein(step)
         restless = moved > _REST
         restless |= (np.abs(step[:, 0]) * np.sqrt(self.matrix[:, 0, 0])
                      > _REST)
@@ -306,6 +310,23 @@ class Tile:
                     lambda: self._take(step, level_step))
         self.form_equations()
         return moved
+
+    def start_polishing(self):
+        """Remember where the stars are."""
+        self.refresh()
+        s = self.stars
+        self.anchor = np.column_stack([s.flux, s.x, s.y])
+
+    def _rein(self, step):
+        """Keep the stars within limits of where polishing started."""
+        s = self.stars
+        now = np.column_stack([s.flux, s.x, s.y])
+        flux = self.anchor[:, :1]
+        low = self.anchor - np.hstack([flux / 2, flux * 0 + _ROAM,
+                                       flux * 0 + _ROAM])
+        high = self.anchor + np.hstack([flux, flux * 0 + _ROAM,
+                                        flux * 0 + _ROAM])
+        step[:] = np.clip(now + step, low, high) - now
 
     def _own_node(self):
         """Return the shares of a background that is constant in cells."""
@@ -529,10 +550,10 @@ def _find_all(tile):
 
 def _settle(tile):
     tile.stars.count[:] = 0
-    tile.refresh()
+    tile.start_polishing()
     tile.moved = np.zeros(len(tile.stars))
-    for number in range(_FINAL_STEPS if len(tile.stars) else 1):
-        tile.moved = tile.polish(1e-4, 0.02 if number < 2 else 0.0)
+    for _ in range(_FINAL_STEPS if len(tile.stars) else 1):
+        tile.moved = tile.polish(1e-3, 0.02)
         if not (tile.moved > _CONVERGED).sum() > 0.005 * len(tile.stars):
             break
     far = ((np.abs(tile.stars.x - tile.left - tile.width // 2) > 1.5)
