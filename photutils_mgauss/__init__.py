@@ -23,6 +23,10 @@ except ImportError:  # a source tree that was never installed
 # Public name -> the module that owns it.
 _OWNERS = {
     'EmpiricalPSF': 'empirical',
+    'CrowdedMixturePhotometry': 'crowded',
+    'InjectionResult': 'crowded',
+    'UnfinishedTilesError': 'crowded',
+    'inject_and_recover': 'crowded',
     'GriddedMixturePSF': 'gridded',
     'PSFAssessment': 'assessment',
     'assess_psf': 'assessment',

@@ -2842,3 +2842,708 @@ def field_model(corners, basis, coefficients, sources, n_sources, sky, out):
         for j in range(n_sources[star]):
             x, y, flux = sources[star, j]
             render(rows, x - left, y - bottom, flux, False, out[star])
+
+
+# Crowded fields: all stars of an image together. Star i is fitted on a square
+# stamp of width[i] pixels, odd, whose first pixel is (left, bottom)[i]; its
+# pixels lie in jets (3, total) from offset[i] on, row by row: the PSF of unit
+# flux and its derivatives by the star's x and y. Stamps may reach over the
+# edges of the image. Parameters are ordered flux, x, y.
+
+@_jit
+def _add_jet_row(peak, u0, dy, p, s, q, jets):
+    """Add a Gaussian's value and derivatives by the centre to jets (3, n)."""
+    n = jets.shape[1]
+    start = min(max(int(np.rint(-u0)), 0), n - 1)
+    u = u0 + start
+    exponent = p * u * u + q * dy * dy
+    if exponent > _LOG_NOTHING:
+        return
+    first = peak * exp(-0.5 * exponent)
+    fall = exp(-p)
+    rise = exp(-p * (u + 0.5))
+    slope_y = q * dy
+    g = first
+    r = rise
+    for i in range(start, n):
+        a = p * (u0 + i) * g
+        jets[0, i] += g
+        jets[1, i] += a
+        jets[2, i] += slope_y * g - s * a
+        g *= r
+        r *= fall
+        if abs(g) < _NOTHING:
+            break
+    if start == 0:
+        return
+    g = first
+    r = fall / rise
+    for i in range(start - 1, -1, -1):
+        g *= r
+        if abs(g) < _NOTHING:
+            break
+        r *= fall
+        a = p * (u0 + i) * g
+        jets[0, i] += g
+        jets[1, i] += a
+        jets[2, i] += slope_y * g - s * a
+
+
+@_jit
+def _add_integrated_jet_row(peak, dx, dy, p, s, q, jets):
+    for i in range(jets.shape[1]):
+        gx, gy = _gradient(dx + i, dy, p, s, q, True)
+        jets[0, i] += peak * _pixel_integral(dx + i, dy, p, s, q)
+        jets[1, i] -= peak * gx
+        jets[2, i] -= peak * gy
+
+
+@_jit
+def star_stamps(chosen, x, y, left, bottom, width, offset, rows, count,
+                integrated, jets):
+    """
+    Fill the stamps of the chosen stars.
+
+    Star i's PSF are the first count[i] rows of rows[i].
+    """
+    for i in chosen:
+        w = width[i]
+        jets[:, offset[i]:offset[i] + w * w] = 0
+        for k in range(count[i]):
+            a, mx, my, p, s, q = rows[i, k]
+            dx = left[i] - x[i] - mx
+            for j in range(w):
+                dy = bottom[i] + j - y[i] - my
+                first = offset[i] + j * w
+                row = jets[:, first:first + w]
+                if integrated:
+                    _add_integrated_jet_row(a, dx, dy, p, s, q, row)
+                else:
+                    _add_jet_row(a, dx - s * dy, dy, p, s, q, row)
+
+
+@_jit
+def add_stars(chosen, sign, x, y, flux, left, bottom, width, offset, wing,
+              jets, rows, count, integrated, image):
+    """
+    Add sign times the chosen stars to the image.
+
+    A star whose wing (half a width, integer) reaches over its stamp is drawn
+    afresh; others are copied from it.
+    """
+    ny, nx = image.shape
+    for i in chosen:
+        w = width[i]
+        if wing[i] <= w // 2:
+            for j in range(max(0, -bottom[i]), min(w, ny - bottom[i])):
+                first = offset[i] + j * w - left[i]
+                for k in range(max(0, left[i]), min(left[i] + w, nx)):
+                    image[bottom[i] + j, k] += (sign * flux[i]
+                                                * jets[0, first + k])
+            continue
+        grow = wing[i] - w // 2
+        x_low = max(0, left[i] - grow)
+        x_high = min(nx, left[i] + w + grow)
+        y_low = max(0, bottom[i] - grow)
+        y_high = min(ny, bottom[i] + w + grow)
+        if x_low >= x_high or y_low >= y_high:
+            continue
+        render(rows[i, :count[i]], x[i] - x_low, y[i] - y_low,
+               sign * flux[i], integrated, image[y_low:y_high, x_low:x_high])
+
+
+@_jit
+def star_equations(flux, left, bottom, width, offset, jets, weight, residual,
+                   matrix, gradient, reach):
+    """
+    Put each star's own normal equations into matrix (n, 3, 3), gradient.
+
+    reach (n, 3) takes the sums of weighted derivatives, which couple the
+    star to the background.
+    """
+    ny, nx = weight.shape
+    for i in range(flux.size):
+        w = width[i]
+        m00 = m01 = m02 = m11 = m12 = m22 = 0.0
+        g0 = g1 = g2 = s0 = s1 = s2 = 0.0
+        for j in range(max(0, -bottom[i]), min(w, ny - bottom[i])):
+            first = offset[i] + j * w - left[i]
+            row = bottom[i] + j
+            for k in range(max(0, left[i]), min(left[i] + w, nx)):
+                v = weight[row, k]
+                d0 = jets[0, first + k]
+                d1 = jets[1, first + k]
+                d2 = jets[2, first + k]
+                e0, e1, e2 = v * d0, v * d1, v * d2
+                r = residual[row, k]
+                m00 += d0 * e0
+                m01 += d0 * e1
+                m02 += d0 * e2
+                m11 += d1 * e1
+                m12 += d1 * e2
+                m22 += d2 * e2
+                g0 += r * e0
+                g1 += r * e1
+                g2 += r * e2
+                s0 += e0
+                s1 += e1
+                s2 += e2
+        f = flux[i]
+        matrix[i, 0, 0] = m00
+        matrix[i, 0, 1] = matrix[i, 1, 0] = f * m01
+        matrix[i, 0, 2] = matrix[i, 2, 0] = f * m02
+        matrix[i, 1, 1] = f * f * m11
+        matrix[i, 1, 2] = matrix[i, 2, 1] = f * f * m12
+        matrix[i, 2, 2] = f * f * m22
+        gradient[i, 0] = g0
+        gradient[i, 1] = f * g1
+        gradient[i, 2] = f * g2
+        reach[i, 0] = s0
+        reach[i, 1] = f * s1
+        reach[i, 2] = f * s2
+
+
+@_jit
+def pair_blocks(indptr, neighbour, twin, flux, left, bottom, width, offset,
+                jets, weight, blocks):
+    """
+    Put the 3 x 3 normal matrices of neighbours into blocks (n_pairs, 3, 3).
+
+    Star i's neighbours are neighbour[indptr[i]:indptr[i + 1]]; twin is where
+    the same pair stands the other way round.
+    """
+    ny, nx = weight.shape
+    for i in range(flux.size):
+        for pair in range(indptr[i], indptr[i + 1]):
+            j = neighbour[pair]
+            if j < i:
+                continue
+            block = blocks[pair]
+            block[:] = 0
+            x_low = max(0, left[i], left[j])
+            x_high = min(nx, left[i] + width[i], left[j] + width[j])
+            for row in range(max(0, bottom[i], bottom[j]),
+                             min(ny, bottom[i] + width[i],
+                                 bottom[j] + width[j])):
+                first = offset[i] + (row - bottom[i]) * width[i] - left[i]
+                other = offset[j] + (row - bottom[j]) * width[j] - left[j]
+                for k in range(x_low, x_high):
+                    v = weight[row, k]
+                    b0 = v * jets[0, other + k]
+                    b1 = v * jets[1, other + k]
+                    b2 = v * jets[2, other + k]
+                    for m in range(3):
+                        a = jets[m, first + k]
+                        block[m, 0] += a * b0
+                        block[m, 1] += a * b1
+                        block[m, 2] += a * b2
+            block[1:] *= flux[i]
+            block[:, 1:] *= flux[j]
+            for m in range(3):
+                for n in range(3):
+                    blocks[twin[pair], n, m] = block[m, n]
+
+
+@_jit
+def _invert_3x3(a, out):
+    """Invert a symmetric matrix; zeros if it is not positive definite."""
+    c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[1, 2]
+    c01 = a[0, 2] * a[1, 2] - a[0, 1] * a[2, 2]
+    c02 = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
+    det = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
+    if not det > 1e-12 * a[0, 0] * a[1, 1] * a[2, 2]:
+        out[:] = 0
+        return
+    out[0, 0] = c00 / det
+    out[0, 1] = out[1, 0] = c01 / det
+    out[0, 2] = out[2, 0] = c02 / det
+    out[1, 1] = (a[0, 0] * a[2, 2] - a[0, 2] * a[0, 2]) / det
+    out[1, 2] = out[2, 1] = (a[0, 1] * a[0, 2] - a[0, 0] * a[1, 2]) / det
+    out[2, 2] = (a[0, 0] * a[1, 1] - a[0, 1] * a[0, 1]) / det
+
+
+@_jit
+def _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node, share,
+                 reach, mesh, out, mesh_out):
+    """Multiply by the joint normal matrix of stars and background."""
+    mesh_out[:] = mesh @ mesh_v
+    for i in range(v.shape[0]):
+        level = 0.0
+        for c in range(4):
+            level += share[i, c] * mesh_v[node[i, c]]
+        o0 = reach[i, 0] * level
+        o1 = reach[i, 1] * level
+        o2 = reach[i, 2] * level
+        a = matrix[i]
+        v0, v1, v2 = v[i, 0], v[i, 1], v[i, 2]
+        o0 += a[0, 0] * v0 + a[0, 1] * v1 + a[0, 2] * v2
+        o1 += a[1, 0] * v0 + a[1, 1] * v1 + a[1, 2] * v2
+        o2 += a[2, 0] * v0 + a[2, 1] * v1 + a[2, 2] * v2
+        light = reach[i, 0] * v0 + reach[i, 1] * v1 + reach[i, 2] * v2
+        for c in range(4):
+            mesh_out[node[i, c]] += share[i, c] * light
+        for pair in range(indptr[i], indptr[i + 1]):
+            b = blocks[pair]
+            j = neighbour[pair]
+            v0, v1, v2 = v[j, 0], v[j, 1], v[j, 2]
+            o0 += b[0, 0] * v0 + b[0, 1] * v1 + b[0, 2] * v2
+            o1 += b[1, 0] * v0 + b[1, 1] * v1 + b[1, 2] * v2
+            o2 += b[2, 0] * v0 + b[2, 1] * v1 + b[2, 2] * v2
+        out[i, 0] = o0
+        out[i, 1] = o1
+        out[i, 2] = o2
+
+
+@_jit
+def _precondition(inverse, mesh, r, mesh_r, z, mesh_z):
+    for i in range(r.shape[0]):
+        for m in range(3):
+            z[i, m] = (inverse[i, m, 0] * r[i, 0] + inverse[i, m, 1] * r[i, 1]
+                       + inverse[i, m, 2] * r[i, 2])
+    for m in range(mesh_r.size):
+        mesh_z[m] = mesh_r[m] / mesh[m, m]
+
+
+@_jit
+def solve_joint(matrix, gradient, indptr, neighbour, blocks, node, share,
+                reach, mesh, mesh_gradient, tolerance, max_steps, step,
+                mesh_step):
+    """
+    Solve the joint normal equations by preconditioned conjugate gradients.
+
+    Stars couple to their neighbours (`pair_blocks`) and to the four nodes
+    node (n, 4) of the background around them, with the bilinear shares
+    share (n, 4); mesh (m, m) is the background's own matrix. Each star's own
+    block is the preconditioner. Returns the number of steps.
+    """
+    n = gradient.shape[0]
+    inverse = np.empty((n, 3, 3))
+    for i in range(n):
+        _invert_3x3(matrix[i], inverse[i])
+    step[:] = 0
+    mesh_step[:] = 0
+    r = gradient.copy()
+    for i in range(n):
+        if inverse[i, 0, 0] == 0:
+            r[i] = 0
+    mesh_r = mesh_gradient.copy()
+    z = np.empty_like(r)
+    mesh_z = np.empty_like(mesh_r)
+    _precondition(inverse, mesh, r, mesh_r, z, mesh_z)
+    v = z.copy()
+    mesh_v = mesh_z.copy()
+    a = np.empty_like(r)
+    mesh_a = np.empty_like(mesh_r)
+    rz = (r * z).sum() + (mesh_r * mesh_z).sum()
+    goal = tolerance * tolerance * rz
+    for count in range(max_steps):
+        if not rz > goal:
+            return count
+        _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node,
+                     share, reach, mesh, a, mesh_a)
+        alpha = rz / ((v * a).sum() + (mesh_v * mesh_a).sum())
+        step += alpha * v
+        mesh_step += alpha * mesh_v
+        r -= alpha * a
+        mesh_r -= alpha * mesh_a
+        for i in range(n):
+            if inverse[i, 0, 0] == 0:
+                r[i] = 0
+        _precondition(inverse, mesh, r, mesh_r, z, mesh_z)
+        before = rz
+        rz = (r * z).sum() + (mesh_r * mesh_z).sum()
+        v = z + rz / before * v
+        mesh_v = mesh_z + rz / before * mesh_v
+    return max_steps
+
+
+@_jit
+def _cholesky(a, n):
+    """Factor a[:n, :n] in place; False where it is not positive definite."""
+    for i in range(n):
+        for j in range(i + 1):
+            total = a[i, j]
+            for k in range(j):
+                total -= a[i, k] * a[j, k]
+            if i == j:
+                if not total > 1e-12:
+                    return False
+                a[i, i] = sqrt(total)
+            else:
+                a[i, j] = total / a[j, j]
+    return True
+
+
+@_jit
+def _factor_inverse_columns(a, n, first, count, out):
+    """
+    Put columns first, ... of inverse(L L^T) into out[:n, :count].
+
+    a holds L below and on its diagonal.
+    """
+    for c in range(count):
+        for i in range(n):
+            total = 1.0 if i == first + c else 0.0
+            for k in range(i):
+                total -= a[i, k] * out[k, c]
+            out[i, c] = total / a[i, i]
+        for i in range(n - 1, -1, -1):
+            total = out[i, c]
+            for k in range(i + 1, n):
+                total -= a[k, i] * out[k, c]
+            out[i, c] = total / a[i, i]
+
+
+@_jit
+def joint_covariances(matrix, indptr, neighbour, blocks, partner, covariance,
+                      correlation):
+    """
+    Put the covariance of each star, neighbours free, into covariance.
+
+    covariance is (n, 3, 3); correlation (n,) takes the correlation of the
+    flux with that of the star partner[i], 0 where it is none of the
+    neighbours. A star's normal matrix is that of itself and up to 12 of its
+    neighbours, those that come first. NaN where it is singular.
+    """
+    most = 13
+    members = np.empty(most, np.int64)
+    where = np.full(matrix.shape[0], -1, np.int64)
+    a = np.empty((3 * most, 3 * most))
+    scale = np.empty(3 * most)
+    columns = np.empty((3 * most, 3))
+    alone = np.empty((3 * most, 1))
+    for i in range(matrix.shape[0]):
+        count = 1
+        members[0] = i
+        for pair in range(indptr[i], indptr[i + 1]):
+            if count == most:
+                break
+            members[count] = neighbour[pair]
+            count += 1
+        size = 3 * count
+        for m in range(count):
+            where[members[m]] = m
+        a[:size, :size] = 0
+        for m in range(count):
+            star = members[m]
+            a[3 * m:3 * m + 3, 3 * m:3 * m + 3] = matrix[star]
+            for pair in range(indptr[star], indptr[star + 1]):
+                other = where[neighbour[pair]]
+                if other >= 0:
+                    for r in range(3):
+                        for c in range(3):
+                            a[3 * m + r, 3 * other + c] = blocks[pair, r, c]
+        for m in range(count):
+            where[members[m]] = -1
+        for m in range(size):
+            scale[m] = 1 / sqrt(a[m, m]) if a[m, m] > 0 else 0.0
+        for r in range(size):
+            for c in range(size):
+                a[r, c] *= scale[r] * scale[c]
+            if scale[r] == 0:
+                a[r, r] = 1.0
+        correlation[i] = 0.0
+        if scale[0] == 0 or not _cholesky(a, size):
+            covariance[i] = np.nan
+            continue
+        _factor_inverse_columns(a, size, 0, 3, columns)
+        for r in range(3):
+            for c in range(3):
+                covariance[i, r, c] = columns[r, c] * scale[r] * scale[c]
+        for m in range(1, count):
+            if members[m] == partner[i]:
+                _factor_inverse_columns(a, size, 3 * m, 1, alone)
+                correlation[i] = columns[3 * m, 0] / sqrt(
+                    columns[0, 0] * alone[3 * m, 0])
+
+
+@_jit
+def score(residual, weight, template, x_low, x_high, y_low, y_high, hint,
+          significance, flux):
+    """
+    Ask at each pixel of a window how significant a star there would be.
+
+    A star of the template (2h + 1, 2h + 1) and a constant are fitted together
+    around the pixel; flux takes the star's flux, significance its ratio to
+    the standard error, 0 where less than a third of the information is left
+    by weights of zero. Pixels are passed over unless the nine around them
+    together stand out by hint standard errors.
+    """
+    ny, nx = residual.shape
+    h = template.shape[0] // 2
+    power = (template**2).sum()
+    for y in range(y_low, y_high):
+        for x in range(x_low, x_high):
+            rs = ws = 0.0
+            for j in range(max(0, y - 1), min(ny, y + 2)):
+                for i in range(max(0, x - 1), min(nx, x + 2)):
+                    rs += weight[j, i] * residual[j, i]
+                    ws += weight[j, i]
+            if not rs > hint * sqrt(ws):
+                continue
+            pr = pp = ps = rs = ws = seen = 0.0
+            for j in range(max(-h, -y), min(h + 1, ny - y)):
+                for i in range(max(-h, -x), min(h + 1, nx - x)):
+                    w = weight[y + j, x + i]
+                    t = template[h + j, h + i]
+                    r = residual[y + j, x + i]
+                    wt = w * t
+                    pr += wt * r
+                    pp += wt * t
+                    ps += wt
+                    rs += w * r
+                    ws += w
+                    if w > 0:
+                        seen += t * t
+            info = pp - ps * ps / ws
+            if 3 * seen > power and info > 0:
+                flux[y, x] = (pr - ps * rs / ws) / info
+                significance[y, x] = flux[y, x] * sqrt(info)
+
+
+@_jit
+def background_equations(residual, weight, level, x_grid, y_grid, limit,
+                         information, gradient):
+    """
+    Put the information on each node of the background, and gradients.
+
+    A node, ordered by y, then x, is the mean of the sky over the pixels
+    nearest to it, so that it depends on nothing further away. Pixels more
+    than limit standard errors from the model take no part.
+    """
+    index = np.empty(4, np.int64)
+    share = np.empty((3, 4))
+    information[:] = 0
+    gradient[:] = 0
+    for y in range(residual.shape[0]):
+        for x in range(residual.shape[1]):
+            w = weight[y, x]
+            r = residual[y, x]
+            if w == 0:
+                continue
+            blend_weights(float(x), float(y), x_grid, y_grid, index, share)
+            here = 0.0
+            node = 0
+            for a in range(4):
+                here += share[0, a] * level[index[a]]
+                if share[0, a] > share[0, node]:
+                    node = a
+            # All pixels count here: stars are coupled through all of theirs.
+            information[index[node]] += w
+            if w * r * r <= limit * limit:
+                gradient[index[node]] += w * (r + here - level[index[node]])
+
+
+@_jit
+def add_background(level, x_grid, y_grid, sign, image):
+    """Add sign times the bilinear background of the nodes to the image."""
+    index = np.empty(4, np.int64)
+    share = np.empty((3, 4))
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            blend_weights(float(x), float(y), x_grid, y_grid, index, share)
+            for a in range(4):
+                image[y, x] += sign * share[0, a] * level[index[a]]
+
+
+@_jit
+def _template_products(x, y, template, weight, residual, light, out):
+    """
+    Put the sums of t w r, t^2 w and (t w light)^2 around a pixel into out.
+
+    False where weights of zero leave less than a third of the information.
+    """
+    ny, nx = residual.shape
+    h = template.shape[0] // 2
+    tr = tt = tl = seen = power = 0.0
+    for j in range(-h, h + 1):
+        for i in range(-h, h + 1):
+            t = template[h + j, h + i]
+            power += t * t
+            if not (0 <= y + j < ny and 0 <= x + i < nx):
+                continue
+            w = weight[y + j, x + i]
+            if w == 0:
+                continue
+            tw = t * w
+            seen += t * t
+            tr += tw * residual[y + j, x + i]
+            tt += tw * t
+            tl += (tw * light[y + j, x + i])**2
+    out[0] = tr
+    out[1] = tt
+    out[2] = tl
+    return 3 * seen >= power
+
+
+@_jit
+def _template_overlap(x, y, template, weight, left, bottom, width, jets, flux,
+                      out):
+    """Put the sums of t w times a star's derivatives into out (3,)."""
+    ny, nx = weight.shape
+    h = template.shape[0] // 2
+    o0 = o1 = o2 = 0.0
+    x_low, x_high = max(0, left, x - h), min(nx, left + width, x + h + 1)
+    for row in range(max(0, bottom, y - h),
+                     min(ny, bottom + width, y + h + 1)):
+        first = (row - bottom) * width - left
+        for k in range(x_low, x_high):
+            tw = template[row - y + h, k - x + h] * weight[row, k]
+            o0 += tw * jets[0, first + k]
+            o1 += tw * jets[1, first + k]
+            o2 += tw * jets[2, first + k]
+    out[0] = o0
+    out[1] = flux * o1
+    out[2] = flux * o2
+
+
+@_jit
+def score_beside(x, y, flux, left, bottom, width, offset, jets, matrix,
+                 gradient, indptr, neighbour, blocks, templates, cell, weight,
+                 residual, light, reach, least, threshold, significance,
+                 found):
+    r"""
+    Ask how significant a further star would be on pixels close to stars.
+
+    For a pixel within reach of a star, nearest to it, the stars around are
+    free to readjust: with the candidate's own information h, gradient g, its
+    overlaps a with the stars' parameters and their normal matrix N and
+    gradient n,
+
+    .. math:: S = (g - a^T N^{-1} n) / \sqrt{h - a^T N^{-1} a + v},
+
+    where v is the variance of g by errors of the PSF, the sum over pixels of
+    :math:`(t w\,\mathrm{light})^2`. Pixels where less than the fraction
+    least of h is left cannot be told from the stars and keep 0. templates is
+    (cells along y, along x, 2h + 1, 2h + 1), each for cell x cell pixels.
+    """
+    ny, nx = residual.shape
+    most = 4
+    members = np.empty(most, np.int64)
+    a = np.empty((3 * most, 3 * most))
+    rhs = np.empty((3 * most, 2))
+    overlap = np.empty(3)
+    sums = np.empty(3)
+    side = int(ceil(reach))
+    for i in range(x.size):
+        for row in range(max(0, int(np.rint(y[i])) - side),
+                         min(ny, int(np.rint(y[i])) + side + 1)):
+            for k in range(max(0, int(np.rint(x[i])) - side),
+                           min(nx, int(np.rint(x[i])) + side + 1)):
+                gap = (x[i] - k)**2 + (y[i] - row)**2
+                if gap > reach * reach:
+                    continue
+                members[0] = i
+                count = 1
+                nearest = True
+                for pair in range(indptr[i], indptr[i + 1]):
+                    j = neighbour[pair]
+                    other = (x[j] - k)**2 + (y[j] - row)**2
+                    if other < gap:
+                        nearest = False
+                        break
+                    if other < 9 and count < most:
+                        members[count] = j
+                        count += 1
+                if not nearest:
+                    continue
+                significance[row, k] = 0.0
+                template = templates[row // cell, k // cell]
+                if not _template_products(k, row, template, weight, residual,
+                                          light, sums):
+                    continue
+                # What the stars' freedom can add is bounded.
+                if not sums[0] > threshold * sqrt(0.3 * least * sums[1]):
+                    continue
+                size = 3 * count
+                for m in range(count):
+                    star = members[m]
+                    _template_overlap(
+                        k, row, template, weight, left[star], bottom[star],
+                        width[star], jets[:, offset[star]:], flux[star],
+                        overlap)
+                    for c in range(3):
+                        rhs[3 * m + c, 0] = overlap[c]
+                        rhs[3 * m + c, 1] = gradient[star, c]
+                        for d in range(3):
+                            a[3 * m + c, 3 * m + d] = matrix[star, c, d]
+                    for n in range(m):
+                        for c in range(3):
+                            for d in range(3):
+                                a[3 * m + c, 3 * n + d] = 0.0
+                        for pair in range(indptr[star], indptr[star + 1]):
+                            if neighbour[pair] == members[n]:
+                                for c in range(3):
+                                    for d in range(3):
+                                        a[3 * m + c, 3 * n + d] = blocks[
+                                            pair, c, d]
+                for c in range(size):
+                    s = 1 / sqrt(a[c, c]) if a[c, c] > 0 else 0.0
+                    rhs[c, 0] *= s
+                    rhs[c, 1] *= s
+                    for d in range(c + 1):
+                        a[c, d] *= s
+                    for d in range(c, size):
+                        a[d, c] *= s
+                    a[c, c] = 1.0 + 1e-9
+                if not _cholesky(a, size):
+                    continue
+                info = sums[1]
+                g = sums[0]
+                for c in range(size):
+                    u, v = rhs[c, 0], rhs[c, 1]
+                    for d in range(c):
+                        u -= a[c, d] * rhs[d, 0]
+                        v -= a[c, d] * rhs[d, 1]
+                    rhs[c, 0] = u / a[c, c]
+                    rhs[c, 1] = v / a[c, c]
+                    info -= rhs[c, 0] * rhs[c, 0]
+                    g -= rhs[c, 0] * rhs[c, 1]
+                if info < least * sums[1]:
+                    continue
+                significance[row, k] = g / sqrt(info + sums[2])
+                found[row, k] = g / info
+
+
+@_jit
+def star_quality(flux, x, y, left, bottom, width, offset, jets, weight,
+                 residual, light, out):
+    """
+    Put sums over each star's stamp into out (n, 6).
+
+    In order: the number of pixels with weight, chi2, the sum of absolute
+    residuals, the residual of the star's central pixel, the star's own share
+    of the light of all stars, and the share of its information on the flux
+    that pixels with weight hold.
+    """
+    ny, nx = weight.shape
+    for i in range(flux.size):
+        w = width[i]
+        count = chi2 = deviation = own = total = seen = power = 0.0
+        for j in range(w):
+            row = bottom[i] + j
+            for k in range(w):
+                column = left[i] + k
+                if not (0 <= row < ny and 0 <= column < nx):
+                    continue
+                p = jets[0, offset[i] + j * w + k]
+                power += p * p
+                v = weight[row, column]
+                if v == 0:
+                    continue
+                r = residual[row, column]
+                count += 1
+                chi2 += v * r * r
+                deviation += abs(r)
+                own += p * flux[i]
+                total += max(light[row, column], 0.0)
+                seen += p * p
+        out[i, 0] = count
+        out[i, 1] = chi2
+        out[i, 2] = deviation
+        row, column = int(np.rint(y[i])), int(np.rint(x[i]))
+        out[i, 3] = np.nan
+        if 0 <= row < ny and 0 <= column < nx and weight[row, column] > 0:
+            out[i, 3] = residual[row, column]
+        out[i, 4] = min(own / total, 1.0) if total > 0 else np.nan
+        out[i, 5] = seen / power if power > 0 else 0.0

@@ -1,0 +1,644 @@
+r"""
+One tile of a crowded image: every star and the background, together.
+
+The image is modelled as stars of unknown positions and fluxes on a bilinear
+background,
+
+.. math::
+
+    M(\mathbf{r}) = b(\mathbf{r}) + \sum_i f_i\,
+    P(\mathbf{r} - \mathbf{r}_i\,|\,\mathbf{r}_i),
+
+and Gauss-Newton steps for all of its parameters at once come from their joint
+normal equations, sparse because a star overlaps only its neighbours.
+Positions here are tile pixels.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import label, maximum_filter
+from scipy.spatial import cKDTree
+
+from photutils_mgauss import _kernels
+from photutils_mgauss._crowded_stars import Neighbours, Stars
+from photutils_mgauss._local_psf import MAX_WING, cells
+
+# Fit stamps are 7 or 9 pixels wide, 13 for bright stars: almost all of the
+# information on a position lies in the core.
+_MIN_HALF, _MAX_HALF, _BRIGHT_HALF = 3, 4, 6
+# In units of noise over the PSF's peak.
+_BRIGHT_FLUX = 300
+# A star is drawn out to where its surface brightness falls below this
+# fraction of the noise.
+_WING_NOISE = 0.1
+# A step of Gauss-Newton moves a star no further than this [pix].
+_MAX_MOVE = 0.4
+# Nor does it change a flux by more than these factors.
+_LEAST_CHANGE, _MOST_CHANGE = 0.2, 2.5
+_CG_STEPS = 60
+# The PSF of a cell of this many pixels serves for finding.
+_CELL = 64
+_TEMPLATE_HALF = 3
+# Pixels where nine together stand out less than this fraction of the
+# threshold are not looked at.
+_HINT = 0.4
+# A further star is looked for within this distance of a known one [pix], with
+# the known one free to move; where less than this fraction of the
+# information is left, the two cannot be told apart.
+_REACH = 2.3
+_LEAST = 0.05
+# No star is added this close to another, or to one that was taken away [pix].
+_SEPARATION = 0.3
+_GRAVE = 0.5
+# Finding starts with the brightest stars.
+_FALLING = (80, 25, 10)
+_FINAL_STEPS = 8
+_CONVERGED = 2e-4
+# Polishing moves no star further than this [pix]: blends that cannot be
+# resolved would run away.
+_ROAM = 0.5
+# A step smaller than this, in pixels and in standard errors, is not taken.
+_REST = 2e-5
+# Pixels further than this from the model take no part in the background.
+_BACKGROUND_CLIP = 4.0
+# How strongly neighbouring nodes are tied, in units of a node's information.
+_TIE = 1e-3
+# Within this distance [pix], stars are too many to be stars if each has less
+# than this many times the PSF's own area, in which half a star's information
+# lies.
+_DENSITY_REACH = 6.0
+_OWN_AREA = 0.7
+# Groups of bad pixels of up to this many may hide a saturated star.
+_SATURATED_PIXELS = (2, 2000)
+
+
+@dataclass(frozen=True)
+class TileOptions:
+    """What all tiles share."""
+
+    threshold: float
+    keep: float
+    background_size: float | None
+    psf_error: float
+    gain: float | None
+    floor: float
+    max_rounds: int
+
+
+@dataclass(frozen=True)
+class TileJob:
+    """
+    A piece of an image, with its margin.
+
+    ``origin`` (y, x) is where its first pixel is in the image, ``core``
+    (y_low, y_high, x_low, x_high) the part, in image pixels, whose stars
+    this tile is to report.
+    """
+
+    data: np.ndarray
+    variance: np.ndarray
+    psf: object
+    options: TileOptions
+    origin: tuple
+    core: tuple
+    given: np.ndarray | None = None
+
+
+class Tile:
+    """The state of a tile while it is being solved."""
+
+    def __init__(self, job):
+        self.data = job.data
+        self.variance = job.variance
+        self.good = job.variance > 0
+        self.psf = job.psf
+        self.options = job.options
+        self.origin = job.origin
+        self.stars = Stars([], [], [], n_rows=self.psf.n_rows)
+        self.graves = np.empty((0, 2))
+        self.weight = np.divide(1, self.variance, where=self.good,
+                                out=np.zeros(self.data.shape))
+        self.noise = 1 / np.sqrt(np.median(self.weight[self.good]))
+        ny, nx = self.data.shape
+        self.profile = self.psf.profile(nx / 2, ny / 2)
+        stamp = self.psf.stamp(nx / 2, ny / 2, MAX_WING)
+        self.area = stamp.sum()**2 / (stamp**2).sum()
+        self.widths = np.empty(0)
+        self._make_mesh()
+        self._make_templates()
+
+    def _make_mesh(self):
+        ny, nx = self.data.shape
+        size = self.options.background_size or max(ny, nx)
+        y_0, x_0 = self.origin
+        self.mesh_x = _lattice(x_0, nx, size) - x_0
+        self.mesh_y = _lattice(y_0, ny, size) - y_0
+        self.ties = _ties(self.mesh_y.size, self.mesh_x.size)
+        start = 0.0
+        if self.options.background_size:
+            # Stars hide the sky.
+            start = np.percentile(self.data[self.good], 20)
+        self.level = np.full(self.mesh_x.size * self.mesh_y.size, start)
+
+    def _make_templates(self):
+        ny, nx = self.data.shape
+        rows, columns = range(0, ny, _CELL), range(0, nx, _CELL)
+        self.templates = np.array([[
+            self.psf.stamp((x + min(x + _CELL, nx)) // 2,
+                           (y + min(y + _CELL, ny)) // 2, _TEMPLATE_HALF)
+            for x in columns] for y in rows])
+
+    # The model.
+
+    def lay_out(self):
+        """Choose stamps and wings, list neighbours."""
+        s = self.stars
+        flux = np.maximum(s.flux, 1e-300)
+        self.wing = np.clip(
+            np.searchsorted(-self.profile, -_WING_NOISE * self.noise / flux),
+            _MIN_HALF, MAX_WING).astype(np.int64)
+        bright = s.flux * self.profile[0] > _BRIGHT_FLUX * self.noise
+        half = np.clip(self.wing, _MIN_HALF, np.where(
+            bright, _BRIGHT_HALF, _MAX_HALF))
+        half[s.seeded] = _BRIGHT_HALF + 2
+        self.wing = np.maximum(self.wing, half)
+        self.width = 2 * half + 1
+        self.left = np.rint(s.x).astype(np.int64) - half
+        self.bottom = np.rint(s.y).astype(np.int64) - half
+        ends = np.cumsum(self.width**2)
+        self.offset = np.concatenate([[0], ends])[:-1].astype(np.int64)
+        self.jets = np.empty((3, self.width @ self.width))
+        self.pairs = Neighbours.of(s.x, s.y)
+
+    def _place(self):
+        return self.left, self.bottom, self.width, self.offset
+
+    def draw(self):
+        """Evaluate all stamps, the residual and the weights."""
+        everyone = np.arange(len(self.stars))
+        self._localise_psf()
+        self._draw_stamps(everyone)
+        self.residual = self.data.copy()
+        self._add_background(-1.0)
+        self._add_stars(everyone, -1.0)
+        self._weigh()
+
+    def redraw(self, changed, change):
+        """Let a function change some stars, and the level; stay up to date."""
+        self._add_stars(changed, 1.0)
+        self._add_background(1.0)
+        change()
+        self._draw_stamps(changed)
+        self._add_background(-1.0)
+        self._add_stars(changed, -1.0)
+        self._weigh()
+
+    def _draw_stamps(self, chosen):
+        s = self.stars
+        _kernels.star_stamps(chosen, s.x, s.y, *self._place(), s.rows,
+                             s.count, self.psf.integrated, self.jets)
+
+    def _add_stars(self, chosen, sign):
+        s = self.stars
+        _kernels.add_stars(chosen, sign, s.x, s.y, s.flux, *self._place(),
+                           self.wing, self.jets, s.rows, s.count,
+                           self.psf.integrated, self.residual)
+
+    def _add_background(self, sign):
+        _kernels.add_background(self.level, self.mesh_x, self.mesh_y, sign,
+                                self.residual)
+
+    def _weigh(self):
+        if self.options.gain is not None:
+            # The photon noise of the model, not that of the data.
+            variance = self.variance - self.residual / self.options.gain
+            variance = np.maximum(variance, self.options.floor)
+            np.divide(1, variance, where=self.good, out=self.weight)
+
+    def _localise_psf(self):
+        """Find the PSF of stars that have none yet."""
+        s = self.stars
+        new = s.count == 0
+        if new.any():
+            s.rows[new], s.count[new] = self.psf.rows_at(s.x[new], s.y[new])
+
+    def star_light(self):
+        """Return the image of the stars alone."""
+        image = self.data - self.residual
+        _kernels.add_background(self.level, self.mesh_x, self.mesh_y, -1.0,
+                                image)
+        return image
+
+    # The joint fit.
+
+    def form_equations(self):
+        """Form the joint normal equations of stars and background."""
+        s, p = self.stars, self.pairs
+        n, m = len(s), self.level.size
+        self.matrix = np.empty((n, 3, 3))
+        self.gradient, self.reach = np.empty((n, 3)), np.empty((n, 3))
+        self.blocks = np.empty((p.neighbour.size, 3, 3))
+        self.mesh_gradient = np.zeros(m)
+        place = (*self._place(), self.jets)
+        _kernels.star_equations(s.flux, *place, self.weight, self.residual,
+                                self.matrix, self.gradient, self.reach)
+        _kernels.pair_blocks(p.indptr, p.neighbour, p.twin, s.flux, *place,
+                             self.weight, self.blocks)
+        information = np.zeros(m)
+        if self.options.background_size:
+            _kernels.background_equations(
+                self.residual, self.weight, self.level, self.mesh_x,
+                self.mesh_y, _BACKGROUND_CLIP, information,
+                self.mesh_gradient)
+        else:
+            self.reach[:] = 0
+        # Nodes without pixels follow their neighbours.
+        tie = _TIE * max(np.median(information), 1e-6 / self.noise**2)
+        self.mesh = np.diag(information) + tie * self.ties
+        self.mesh_gradient -= tie * self.ties @ self.level
+
+    def refresh(self):
+        """Bring everything up to date with the stars."""
+        self.lay_out()
+        self.draw()
+        self.form_equations()
+
+    def _solve(self, tolerance, damping):
+        """Return the Gauss-Newton step of the stars and of the level."""
+        s, p = self.stars, self.pairs
+        step = np.empty((len(s), 3))
+        level_step = np.empty(self.level.size)
+        matrix = self.matrix * (1 + damping * np.eye(3))
+        _kernels.solve_joint(
+            matrix, self.gradient, p.indptr, p.neighbour, self.blocks,
+            *self._own_node(), self.reach, self.mesh, self.mesh_gradient,
+            tolerance, _CG_STEPS, step, level_step)
+        step[:, 1:] = np.clip(step[:, 1:], -_MAX_MOVE, _MAX_MOVE)
+        step[:, 0] = np.clip(step[:, 0], (_LEAST_CHANGE - 1) * s.flux,
+                             (_MOST_CHANGE - 1) * s.flux)
+        return step, level_step
+
+    def _take(self, step, level_step):
+        s = self.stars
+        s.flux = s.flux + step[:, 0]
+        s.x = s.x + step[:, 1]
+        s.y = s.y + step[:, 2]
+        self.level = self.level + level_step
+
+    def step(self, tolerance, damping=0.0):
+        """Take one Gauss-Newton step; return how far each star moved."""
+        step, level_step = self._solve(tolerance, damping)
+        self._take(step, level_step)
+        self.refresh()
+        return np.abs(step[:, 1:]).max(axis=1, initial=0)
+
+    def polish(self, tolerance, damping):
+        """
+        Take a step without a new layout; return how far each star moved.
+
+        Stamps stay where they are, so that steps converge; stars that are
+        at rest stay as they are.
+        """
+        step, level_step = self._solve(tolerance, damping)
+        moved = np.abs(step[:, 1:]).max(axis=1, initial=0)
+        self._rein(step)
+        restless = moved > _REST
+        restless |= (np.abs(step[:, 0]) * np.sqrt(self.matrix[:, 0, 0])
+                     > _REST)
+        step[~restless] = 0
+        self.redraw(np.flatnonzero(restless),
+                    lambda: self._take(step, level_step))
+        self.form_equations()
+        return moved
+
+    def start_polishing(self):
+        """Remember where the stars are."""
+        self.refresh()
+        s = self.stars
+        self.anchor = np.column_stack([s.flux, s.x, s.y])
+
+    def _rein(self, step):
+        """Keep the stars within limits of where polishing started."""
+        s = self.stars
+        now = np.column_stack([s.flux, s.x, s.y])
+        flux = self.anchor[:, :1]
+        low = self.anchor - np.hstack([flux / 2, flux * 0 + _ROAM,
+                                       flux * 0 + _ROAM])
+        high = self.anchor + np.hstack([flux, flux * 0 + _ROAM,
+                                        flux * 0 + _ROAM])
+        step[:] = np.clip(now + step, low, high) - now
+
+    def _own_node(self):
+        """Return the shares of a background that is constant in cells."""
+        # Only such a one makes, with each node's own mean, a matrix that is
+        # positive definite; where steps end does not depend on it.
+        node, share = self._shares()
+        own = np.zeros(share.shape)
+        own[np.arange(len(own)), share.argmax(axis=1)] = 1
+        return node, own
+
+    def _shares(self):
+        """Return each star's four nodes of the background and shares."""
+        s, n = self.stars, self.mesh_x.size
+        column, fx = cells(s.x, self.mesh_x)
+        row, fy = cells(s.y, self.mesh_y)
+        node = (row * n + column)[:, None] + np.array([0, 1, n, n + 1])
+        share = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy,
+                          fx * fy], axis=1)
+        return node, share
+
+    def covariances(self):
+        """Return covariances with neighbours free, and correlations."""
+        p = self.pairs
+        covariance = np.empty((len(self.stars), 3, 3))
+        correlation = np.empty(len(self.stars))
+        _kernels.joint_covariances(self.matrix, p.indptr, p.neighbour,
+                                   self.blocks, p.nearest, covariance,
+                                   correlation)
+        return covariance, correlation
+
+    # Finding and leaving out.
+
+    def find(self, threshold, found_in):
+        """Add the maxima of significance on the residual; return how many."""
+        significance, flux = self._scores(threshold)
+        peak = (significance > threshold) & (
+            significance == maximum_filter(significance, 3))
+        y, x = np.nonzero(peak)
+        dx, dy = _vertex(significance, x, y)
+        found = Stars(x + dx, y + dy, flux[y, x],
+                      significance=significance[y, x], found_in=found_in,
+                      n_rows=self.psf.n_rows)
+        found.select(self._apart(found))
+        self.stars.append(found)
+        return len(found)
+
+    def _scores(self, threshold):
+        ny, nx = self.data.shape
+        significance = np.zeros((ny, nx))
+        flux = np.zeros((ny, nx))
+        light = self.options.psf_error * np.maximum(self.star_light(), 0)
+        weight = np.divide(self.weight, 1 + self.weight * light**2)
+        for j, i in np.ndindex(self.templates.shape[:2]):
+            _kernels.score(
+                self.residual, weight, self.templates[j, i], i * _CELL,
+                min((i + 1) * _CELL, nx), j * _CELL, min((j + 1) * _CELL, ny),
+                _HINT * threshold, significance, flux)
+        s, p = self.stars, self.pairs
+        _kernels.score_beside(
+            s.x, s.y, s.flux, *self._place(), self.jets, self.matrix,
+            self.gradient, p.indptr, p.neighbour, self.blocks, self.templates,
+            _CELL, self.weight, self.residual, light, _REACH, _LEAST,
+            threshold, significance, flux)
+        return significance, flux
+
+    def _apart(self, found):
+        apart = np.ones(len(found), bool)
+        positions = np.column_stack([found.x, found.y])
+        stars = np.column_stack([self.stars.x, self.stars.y])
+        for places, limit in ((stars, _SEPARATION), (self.graves, _GRAVE)):
+            if len(places) and len(found):
+                apart &= cKDTree(places).query(positions)[0] > limit
+        return apart & ~self.too_dense(found.x, found.y)
+
+    def too_dense(self, x, y):
+        """Tell at which positions there are more stars than can be."""
+        s = self.stars
+        if not len(s) or not len(x):
+            return np.zeros(len(x), bool)
+        tree = cKDTree(np.column_stack([s.x, s.y]))
+        count = tree.query_ball_point(np.column_stack([x, y]),
+                                      _DENSITY_REACH, return_length=True)
+        # The part of the circle that is on the tile.
+        ny, nx = self.data.shape
+        part = [np.minimum(v + 0.5, _DENSITY_REACH)
+                + np.minimum(n - 0.5 - v, _DENSITY_REACH)
+                for v, n in ((x, nx), (y, ny))]
+        space = np.pi / 4 * np.prod(np.maximum(part, 1), axis=0)
+        return (count * self.area * _OWN_AREA > space) & (count > 5)
+
+    def leave_out(self, threshold):
+        """Remove the weakest of each clump of insignificant stars."""
+        s, p = self.stars, self.pairs
+        covariance, _ = self.covariances()
+        with np.errstate(invalid='ignore'):
+            strength = s.flux / np.sqrt(covariance[:, 0, 0])
+        weak = ~(strength >= threshold)
+        near = np.hypot(s.x[p.owner] - s.x[p.neighbour],
+                        s.y[p.owner] - s.y[p.neighbour]) < 2
+        rival = (near & weak[p.neighbour]
+                 & (s.flux[p.neighbour] < s.flux[p.owner]))
+        weak[p.owner[rival]] = False
+        ny, nx = self.data.shape
+        weak |= (s.x < -1) | (s.y < -1) | (s.x > nx) | (s.y > ny)
+        gone = np.flatnonzero(weak)
+        places = np.column_stack([s.x[gone], s.y[gone]])
+        s.select(~weak)
+        return places
+
+    def seed_saturated(self):
+        """Put a star on each clump of bad pixels that has a star's wings."""
+        clumps, n = label(~self.good)
+        if n == 0:
+            return
+        size = np.bincount(clumps.ravel())[1:]
+        low, high = _SATURATED_PIXELS
+        found = [self._wing_star(clumps, k + 1)
+                 for k in np.flatnonzero((size >= low) & (size <= high))]
+        found = [star for star in found if star is not None]
+        if found:
+            x, y, flux, significance = np.array(found).T
+            self.stars.append(Stars(x, y, flux, significance=significance,
+                                    seeded=True, n_rows=self.psf.n_rows))
+
+    def _wing_star(self, clumps, k):
+        y, x = np.nonzero(clumps == k)
+        column, row = round(x.mean()), round(y.mean())
+        half = int(max(np.ptp(x), np.ptp(y)) / 2) + 6
+        ny, nx = self.data.shape
+        part = (slice(max(0, row - half), min(ny, row + half + 1)),
+                slice(max(0, column - half), min(nx, column + half + 1)))
+        stamp = self.psf.stamp(column, row, half)[
+            part[0].start - row + half:part[0].stop - row + half,
+            part[1].start - column + half:part[1].stop - column + half]
+        w = self.weight[part]
+        info = (w * stamp**2).sum()
+        if info == 0:
+            return None
+        # The faintest wing pixels say how bright the star can be: others may
+        # hold neighbours.
+        seen = (w > 0) & (stamp > 0.002 * stamp.max())
+        if seen.sum() < 8:
+            return None
+        ratio = (self.data[part] - self.level[0])[seen] / stamp[seen]
+        flux = np.median(ratio)
+        significance = flux * np.sqrt(info)
+        if significance < 10 * self.options.threshold:
+            return None
+        return x.mean(), y.mean(), flux, significance
+
+
+def solve_tile(job):
+    """
+    Find and fit the stars of a tile.
+
+    Parameters
+    ----------
+    job : TileJob
+
+    Returns
+    -------
+    Tile
+        Solved, its equations those of the solution, with ``moved`` (n,), how
+        far each star went in the last step.
+    """
+    tile = Tile(job)
+    if job.given is not None:
+        x, y, flux, number = job.given
+        tile.stars = Stars(x, y, flux, number=number.astype(int),
+                           n_rows=tile.psf.n_rows)
+        _warm_up(tile)
+    else:
+        tile.seed_saturated()
+        tile.refresh()
+        _find_all(tile)
+    _settle(tile)
+    return tile
+
+
+def _warm_up(tile):
+    """Bring given stars, perhaps without fluxes, near their solution."""
+    s = tile.stars
+    ny, nx = tile.data.shape
+    unknown = ~(s.flux > 0)
+    x = np.clip(np.rint(s.x), 0, nx - 1).astype(int)
+    y = np.clip(np.rint(s.y), 0, ny - 1).astype(int)
+    peak = np.maximum(tile.data[y, x] - tile.level.min(), tile.noise)
+    s.flux = np.where(unknown, peak / tile.profile[0], s.flux)
+    tile.refresh()
+    for damping in (1.0, 0.3, 0.1, 0.03):
+        tile.step(1e-2, damping)
+
+
+def _find_all(tile):
+    options = tile.options
+    for number, threshold in enumerate(_FALLING):
+        if threshold > options.threshold and tile.find(threshold, number):
+            tile.refresh()
+            tile.step(1e-2, 0.05)
+            if number == 0:
+                # Later, errors of the PSF are hidden by false companions.
+                tile.step(1e-2, 0.05)
+                tile.widths = _size_differences(tile)
+            tile.leave_out(1.0)
+            tile.refresh()
+    for number in range(options.max_rounds):
+        new = tile.find(options.threshold, len(_FALLING) + number)
+        if new:
+            tile.refresh()
+            tile.step(1e-2, 0.05)
+            tile.step(1e-2, 0.01)
+        if number > 1:
+            gone = tile.leave_out(options.keep)
+            tile.graves = np.concatenate([tile.graves, gone])
+        else:
+            gone = tile.leave_out(0.7 * options.keep)
+        tile.refresh()
+        if new <= 0.005 * len(tile.stars):
+            break
+
+
+def _settle(tile):
+    tile.stars.count[:] = 0
+    tile.start_polishing()
+    tile.moved = np.zeros(len(tile.stars))
+    for _ in range(_FINAL_STEPS if len(tile.stars) else 1):
+        tile.moved = tile.polish(1e-3, 0.02)
+        if not (tile.moved > _CONVERGED).sum() > 0.005 * len(tile.stars):
+            break
+    far = ((np.abs(tile.stars.x - tile.left - tile.width // 2) > 1.5)
+           | (np.abs(tile.stars.y - tile.bottom - tile.width // 2) > 1.5))
+    if far.any():
+        tile.refresh()
+
+
+def _lattice(first, size, spacing):
+    """Return the multiples of spacing that are nearest to a pixel."""
+    low = np.rint(first / spacing)
+    high = max(np.rint((first + size - 1) / spacing), low + 1)
+    return np.arange(low, high + 1) * float(spacing)
+
+
+def _ties(ny, nx):
+    """Return the matrix of the sum of squared differences of neighbours."""
+    number = np.arange(ny * nx).reshape(ny, nx)
+    out = np.zeros((ny * nx, ny * nx))
+    pairs = ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1]))
+    for after, before in pairs:
+        a, b = after.ravel(), before.ravel()
+        np.add.at(out, (a, a), 1)
+        np.add.at(out, (b, b), 1)
+        out[a, b] -= 1
+        out[b, a] -= 1
+    return out
+
+
+def _vertex(image, x, y):
+    """Return the offsets of the tops of parabolas through three pixels."""
+    ny, nx = image.shape
+    out = []
+    for step_x, step_y in ((1, 0), (0, 1)):
+        here = image[y, x]
+        after = image[np.minimum(y + step_y, ny - 1),
+                      np.minimum(x + step_x, nx - 1)]
+        before = image[np.maximum(y - step_y, 0), np.maximum(x - step_x, 0)]
+        bend = 2 * here - before - after
+        shift = np.divide(0.5 * (after - before), bend, where=bend > 0,
+                          out=np.zeros(x.size))
+        out.append(np.clip(shift, -0.5, 0.5))
+    return out
+
+
+def _size_differences(tile):
+    """
+    Return by how much the PSF's variance is too small at bright stars.
+
+    The Laplacian of a PSF is its derivative by the variance of a Gaussian it
+    is convolved with; its amplitude in the residual is fitted, with star and
+    Laplacian together: a star that is too wide is too bright, too.
+    """
+    s, out = tile.stars, []
+    bright = np.flatnonzero(
+        (s.flux * tile.profile[0] > 50 * tile.noise) & ~s.seeded)
+    ny, nx = tile.data.shape
+    for i in bright[np.argsort(-s.flux[bright])][:200]:
+        w, y, x = tile.width[i], tile.bottom[i], tile.left[i]
+        if x < 0 or y < 0 or x + w > nx or y + w > ny:
+            continue
+        window = slice(y, y + w), slice(x, x + w)
+        stamp = tile.jets[0, tile.offset[i]:tile.offset[i] + w * w]
+        out.append(_size_difference(stamp.reshape(w, w), s.flux[i],
+                                    tile.weight[window],
+                                    tile.residual[window]))
+    return np.array([value for value in out if np.isfinite(value)])
+
+
+def _size_difference(stamp, flux, weight, residual):
+    # A bright star's PSF error is in proportion to its light, whatever the
+    # photon noise: all pixels of the stamp count alike.
+    good = (weight > 0).astype(float)
+    slope = sum(np.gradient(np.gradient(stamp, axis=a), axis=a)
+                for a in (0, 1)) / 2
+    data = residual / flux
+    a = (good * slope * slope).sum()
+    b = (good * slope * stamp).sum()
+    c = (good * stamp * stamp).sum()
+    det = a * c - b * b
+    if not det > 0:
+        return np.nan
+    change = (c * (good * slope * data).sum()
+              - b * (good * stamp * data).sum()) / det
+    j, k = np.indices(stamp.shape) - len(stamp) // 2
+    core = (j**2 + k**2) <= 9
+    size = (stamp * core * (j**2 + k**2)).sum() / (2 * (stamp * core).sum())
+    return change / size

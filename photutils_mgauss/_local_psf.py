@@ -1,0 +1,182 @@
+"""
+The PSF at many positions of a tile, as few Gaussians as possible.
+
+Between four nodes of a grid the PSF is a sum of 4 K Gaussians, in four
+families of similar ones. Where one Gaussian with the weight, mean and
+covariance of its family can stand for it, K Gaussians do.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from photutils_mgauss import _kernels
+
+MAX_WING = 60
+# A cell's families are merged if that changes no pixel by more than this
+# fraction of the peak.
+_MERGE_TOLERANCE = 1e-3
+
+
+def _rows(weights, means, covariances):
+    """Return the kernels' rows of arrays of Gaussians (..., 6)."""
+    sxx = covariances[..., 0, 0]
+    sxy = covariances[..., 0, 1]
+    syy = covariances[..., 1, 1]
+    det = sxx * syy - sxy**2
+    return np.stack([weights / (2 * np.pi * np.sqrt(det)), means[..., 0],
+                     means[..., 1], syy / det, sxy / syy, 1 / syy], axis=-1)
+
+
+def cells(position, nodes):
+    """Return the cell of each position and the fraction of it passed."""
+    if nodes.size == 1:
+        return np.zeros(position.size, int), np.zeros(position.size)
+    cell = np.searchsorted(nodes, position, side='right') - 1
+    cell = np.clip(cell, 0, nodes.size - 2)
+    passed = (position - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+    return cell, np.clip(passed, 0, 1)
+
+
+@dataclass(frozen=True)
+class LocalPSF:
+    """
+    A PSF grid in the coordinates of a tile.
+
+    ``weights`` (M, K), ``means`` (M, K, 2) and ``covariances`` (M, K, 2, 2)
+    are those of the nodes, weights in units of flux on the detector;
+    ``order`` (cells along y, along x, 4, K) says which Gaussians of a cell's
+    corners form a family, ``merged`` which cells' families are merged.
+    """
+
+    x_grid: np.ndarray
+    y_grid: np.ndarray
+    weights: np.ndarray
+    means: np.ndarray
+    covariances: np.ndarray
+    integrated: bool
+    order: np.ndarray
+    merged: np.ndarray
+
+    @classmethod
+    def from_nodes(cls, x_grid, y_grid, weights, means, covariances,
+                   integrated):
+        """Find families and which of them can be merged."""
+        shape = (max(y_grid.size - 1, 1), max(x_grid.size - 1, 1))
+        k = weights.shape[1]
+        order = np.tile(np.arange(k), (*shape, 4, 1))
+        psf = cls(x_grid, y_grid, weights, means, covariances, integrated,
+                  order, np.zeros(shape, bool))
+        for j, i in np.ndindex(shape):
+            psf._join_families(j, i)
+        return psf
+
+    @property
+    def n_rows(self):
+        """The largest number of Gaussians of a star."""
+        k = self.weights.shape[1]
+        return k if self.merged.all() else 4 * k
+
+    def moved(self, x, y):
+        """Return the PSF with the origin of coordinates at (x, y)."""
+        return LocalPSF(self.x_grid - x, self.y_grid - y, self.weights,
+                        self.means, self.covariances, self.integrated,
+                        self.order, self.merged)
+
+    def _corners(self, j, i):
+        i_next = np.minimum(i + 1, self.x_grid.size - 1)
+        j_next = np.minimum(j + 1, self.y_grid.size - 1)
+        n = self.x_grid.size
+        return np.stack([j * n + i, j * n + i_next, j_next * n + i,
+                         j_next * n + i_next], axis=-1)
+
+    def _join_families(self, j, i):
+        corners = self._corners(j, i)
+        features = np.concatenate([
+            self.weights[..., None], self.means,
+            self.covariances.reshape(*self.weights.shape, 4)], axis=-1)
+        first = features[corners[0]]
+        for c in range(1, 4):
+            other = features[corners[c]]
+            cost = ((first[:, None] - other) ** 2).sum(axis=-1)
+            self.order[j, i, c] = linear_sum_assignment(cost)[1]
+        x, y = self._middle(j, i)
+        exact = self._stamp(*self.rows_at(x, y))
+        self.merged[j, i] = True
+        change = np.abs(self._stamp(*self.rows_at(x, y)) - exact).max()
+        self.merged[j, i] = change <= _MERGE_TOLERANCE * exact.max()
+
+    def _middle(self, j, i):
+        out = []
+        for cell, nodes in ((i, self.x_grid), (j, self.y_grid)):
+            after = min(cell + 1, nodes.size - 1)
+            out.append(np.array([(nodes[cell] + nodes[after]) / 2]))
+        return out
+
+    def _stamp(self, rows, count):
+        stamp = np.zeros((17, 17))
+        _kernels.render(rows[0, :count[0]], 8.0, 8.0, 1.0, self.integrated,
+                        stamp)
+        return stamp
+
+    def rows_at(self, x, y):
+        """
+        Return the Gaussians of stars of unit flux at positions (n,).
+
+        Returns
+        -------
+        rows : (n, n_rows, 6) `~numpy.ndarray`
+        count : (n,) `~numpy.ndarray` of int
+            How many of the rows are used.
+        """
+        i, fx = cells(x, self.x_grid)
+        j, fy = cells(y, self.y_grid)
+        share = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy,
+                          fx * fy], axis=1)
+        node = self._corners(j, i)[..., None]
+        order = self.order[j, i]
+        weights = share[..., None] * self.weights[node, order]
+        means = self.means[node, order]
+        covariances = self.covariances[node, order]
+        n, _, k = weights.shape
+        merged = self.merged[j, i]
+        count = np.where(merged, k, 4 * k)
+        rows = np.zeros((n, self.n_rows, 6))
+        one = merged
+        rows[one, :k] = _merge(weights[one], means[one], covariances[one])
+        four = ~merged
+        if four.any():
+            rows[four] = _rows(weights, means, covariances)[four].reshape(
+                -1, 4 * k, 6)
+        return rows, count
+
+    def stamp(self, x, y, half):
+        """Draw a star of unit flux in the middle of a stamp."""
+        rows, count = self.rows_at(np.array([float(x)]), np.array([float(y)]))
+        out = np.zeros((2 * half + 1, 2 * half + 1))
+        _kernels.render(rows[0, :count[0]], float(half), float(half), 1.0,
+                        self.integrated, out)
+        return out
+
+    def profile(self, x, y):
+        """Return the brightest pixel at each distance, never rising."""
+        stamp = self.stamp(x, y, MAX_WING)
+        distance = np.hypot(*np.mgrid[-MAX_WING:MAX_WING + 1,
+                                      -MAX_WING:MAX_WING + 1])
+        ring = np.rint(distance).astype(int).ravel()
+        top = np.zeros(ring.max() + 1)
+        np.maximum.at(top, ring, stamp.ravel())
+        return np.maximum.accumulate(top[MAX_WING::-1])[::-1]
+
+
+def _merge(weights, means, covariances):
+    """Return the rows (n, K, 6) of the families along axis 1."""
+    total = weights.sum(axis=1)
+    safe = np.where(total == 0, 1, total)
+    part = weights / safe[:, None]
+    # Families of weight zero keep any shape.
+    part = np.where(total[:, None] == 0, 0.25, part)
+    mean = (part[..., None] * means).sum(axis=1)
+    offset = means - mean[:, None]
+    spread = covariances + offset[..., :, None] * offset[..., None, :]
+    return _rows(total, mean, (part[..., None, None] * spread).sum(axis=1))

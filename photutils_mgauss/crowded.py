@@ -1,0 +1,643 @@
+r"""
+Crowded fields: all stars of an image found and fitted together.
+
+Every star is fitted with its neighbours free, in an image of which all other
+stars are subtracted, as Sec. 5 of Nie et al. asks of a method for the
+Galactic bulge.
+"""
+import warnings
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.nddata import NDData
+from astropy.table import QTable, Table, vstack
+from astropy.utils.exceptions import AstropyUserWarning
+
+from photutils_mgauss import _injection as injection
+from photutils_mgauss import _kernels
+from photutils_mgauss._crowded_image import Image, find_gain
+from photutils_mgauss._crowded_table import StarTable, as_qtable, tabulate
+from photutils_mgauss._crowded_tile import TileJob, TileOptions, solve_tile
+from photutils_mgauss._injection import InjectionResult
+from photutils_mgauss._local_psf import LocalPSF
+from photutils_mgauss._parallel import available_cores
+from photutils_mgauss._validation import (
+    as_floats,
+    as_integer,
+    as_real,
+    as_shape,
+)
+
+__all__ = ['CrowdedMixturePhotometry', 'InjectionResult',
+           'UnfinishedTilesError', 'inject_and_recover']
+
+_NAMES = {'x': ('x_init', 'x', 'x_fit', 'x_centroid', 'xcentroid'),
+          'y': ('y_init', 'y', 'y_fit', 'y_centroid', 'ycentroid'),
+          'flux': ('flux_init', 'flux', 'flux_fit')}
+# A PSF whose size is off by more than this fraction is warned of.
+_WIDTH_TOLERANCE = 0.1
+
+
+class UnfinishedTilesError(RuntimeError):
+    """
+    Raised when some tiles of an image could not be solved.
+
+    Parameters
+    ----------
+    unfinished : list of (y_low, y_high, x_low, x_high) tuple of int
+        The parts of the image, in pixels, without a result.
+    table : `~astropy.table.QTable`
+        The stars of the tiles that were finished.
+    """
+
+    def __init__(self, unfinished, table):
+        self.unfinished = unfinished
+        self.table = table
+        super().__init__(unfinished, table)
+
+    def __str__(self):
+        return (f'{len(self.unfinished)} tiles were not finished, at (y_low, '
+                f'y_high, x_low, x_high) = {self.unfinished}; the stars of '
+                f'the others are in the attribute table')
+
+
+class CrowdedMixturePhotometry:
+    r"""
+    PSF photometry of crowded fields.
+
+    Stars are looked for on the residual, brightest first, and beside known
+    stars with these free to readjust; all stars and a smooth background are
+    fitted together,
+
+    .. math::
+
+        \chi^2 = \sum_{\mathrm{pix}} \frac{1}{\sigma^2} \Big[D - b -
+        \sum_i f_i\,P(\mathbf{r} - \mathbf{r}_i)\Big]^2,
+
+    by Gauss-Newton steps for all parameters at once; what has become
+    insignificant is left out; and so on until nothing significant is left.
+
+    Parameters
+    ----------
+    psf_model : GriddedMixturePSF or MultiGaussianPSFModel
+        The PSF.
+    threshold : float, optional
+        The significance from which a star is added, in standard errors of
+        its flux.
+    keep : float, optional
+        Found stars whose flux, with their neighbours free, has fewer
+        standard errors than this are left out again.
+    background_size : float or None, optional
+        The distance of the nodes of the bilinear background [pix], or None
+        if there is no background to fit.
+    psf_error : float, optional
+        How well the PSF is known, as a fraction: residuals of bright stars
+        below it are not taken for stars.
+    effective_gain : float, optional
+        Electrons per unit of the data. With it the photon noise in ``error``
+        is replaced by that of the model, which avoids a bias of faint
+        fluxes. By default it is found out from ``data`` and ``error``;
+        infinity leaves the error as it is.
+    maxiters : int, optional
+        The largest number of searches at the final threshold.
+    tile_shape : int or (ny, nx) tuple of int, optional
+        The image is solved in tiles of this many pixels.
+    overlap : int, optional
+        How far a tile sees beyond its borders [pix].
+    executor : `~concurrent.futures.Executor`, optional
+        Where tiles are solved; by default a pool of threads on all cores.
+    progress_bar : bool, optional
+        Whether to show a bar with the stars found and their chi2.
+
+    Attributes
+    ----------
+    results : `~astropy.table.QTable`
+        The last table.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not valid.
+
+    Notes
+    -----
+    Columns beside photutils' own: ``xy_cov``, the covariance of x and y
+    [pix^2]; ``significance`` of the detection; ``crowding``, the star's share
+    of the light of all stars in its fit pixels; ``neighbor_distance`` [pix]
+    and ``neighbor_correlation``, the correlation with the nearest
+    neighbour's flux; ``iter_detected``. Bits of ``flags`` beside photutils'
+    own: 65536, most of the star is masked, as of saturated ones; 131072, a
+    blend, the correlation is beyond 0.5; 262144, not a star: part of
+    something extended.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from photutils_mgauss import (CrowdedMixturePhotometry,
+    ...                               GaussianMixture, GriddedMixturePSF)
+    >>> mixture = GaussianMixture([1], [[0, 0]], [[[0.7, 0], [0, 0.8]]])
+    >>> psf = GriddedMixturePSF([mixture], [(0, 0)])
+    >>> data = 20 + sum(mixture.render((40, 40), x, y, flux=f)
+    ...                 for x, y, f in [(15.2, 17, 3e4), (16.9, 18.1, 9e3)])
+    >>> rng = np.random.default_rng(1)
+    >>> error = np.sqrt(data)
+    >>> phot = CrowdedMixturePhotometry(psf)
+    >>> table = phot(data + error * rng.normal(size=data.shape), error=error)
+    >>> len(table)
+    2
+    >>> bool(abs(table['x_fit'] - [15.2, 16.9]).max() < 0.05)
+    True
+    """
+
+    def __init__(self, psf_model, *, threshold=4.5, keep=2.5,
+                 background_size=64, psf_error=0.01, effective_gain=None,
+                 maxiters=4, tile_shape=512, overlap=48, executor=None,
+                 progress_bar=False):
+        self.psf_model = psf_model
+        self.threshold = as_real(threshold, 'threshold', above=0)
+        self.keep = as_real(keep, 'keep', minimum=0)
+        self.background_size = background_size
+        if background_size is not None:
+            self.background_size = as_real(background_size, 'background_size',
+                                           minimum=8)
+        self.psf_error = as_real(psf_error, 'psf_error', minimum=0)
+        self.effective_gain = effective_gain
+        if effective_gain is not None and effective_gain != np.inf:
+            self.effective_gain = as_real(effective_gain, 'effective_gain',
+                                          above=0)
+        self.maxiters = as_integer(maxiters, 'maxiters', minimum=1)
+        self.tile_shape = as_shape(tile_shape, 'tile_shape', minimum=32)
+        self.overlap = as_integer(overlap, 'overlap', minimum=8)
+        self.executor = executor
+        self.progress_bar = bool(progress_bar)
+        self.results = None
+        self._psf = _local_psf(psf_model)
+
+    def __call__(self, data, *, mask=None, error=None, init_params=None):
+        """
+        Find and fit the stars of an image.
+
+        Parameters
+        ----------
+        data : (ny, nx) array_like, `~astropy.units.Quantity` or \
+                `~astropy.nddata.NDData`
+            The image.
+        mask : (ny, nx) array_like of bool, optional
+            True for pixels to leave out; pixels that are not finite, or
+            whose error is not positive, are left out, too.
+        error : (ny, nx) array_like, optional
+            The standard deviation of each pixel. By default it is estimated,
+            one number for the image.
+        init_params : `~astropy.table.Table`, optional
+            Positions ``x_init``, ``y_init`` and, if known, ``flux_init`` to
+            fit instead of finding stars. None is added, none left out, and
+            the result has their order.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            One row for each star.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not valid.
+        UnfinishedTilesError
+            If a worker failed; the finished tiles are in the error.
+        """
+        image = Image.of(data, error, mask)
+        self._image = image
+        given = None if init_params is None else _given(init_params)
+        options = self._options(image)
+        jobs = [_job(image, self._psf, options, core, self.overlap, given)
+                for core in _cores(image.data.shape, self.tile_shape)]
+        jobs = [job for job in jobs if (job.variance > 0).any()
+                and (given is None or job.given.size)]
+        outcomes = self._run(jobs)
+        done = [outcome for outcome in outcomes if outcome is not None]
+        stars = StarTable.joined([outcome.stars for outcome in done])
+        meta = self._report(done, stars)
+        if given is not None:
+            stars = _in_given_order(stars, given)
+        else:
+            stars = stars.select(np.lexsort((stars.columns['x_fit'],
+                                             stars.columns['y_fit'])))
+        self.results = as_qtable(stars, image.unit, meta)
+        if len(done) < len(jobs):
+            unfinished = [_clipped(job.core, image.data.shape)
+                          for job, outcome in zip(jobs, outcomes, strict=True)
+                          if outcome is None]
+            raise UnfinishedTilesError(unfinished, self.results) from next(
+                e for e in self._errors)
+        return self.results
+
+    def _options(self, image):
+        gain = self.effective_gain
+        if gain is None:
+            gain = find_gain(image)
+        good = image.variance > 0
+        floor = image.variance[good].min() if good.any() else 1.0
+        return TileOptions(
+            threshold=self.threshold, keep=self.keep,
+            background_size=self.background_size, psf_error=self.psf_error,
+            gain=None if gain in (None, np.inf) else float(gain),
+            floor=float(floor), max_rounds=self.maxiters)
+
+    def _run(self, jobs):
+        """Return the outcome of each job, None where it failed."""
+        self._errors = []
+        if self.executor is not None:
+            return self._collect(self.executor, jobs)
+        with ThreadPoolExecutor(available_cores()) as pool:
+            return self._collect(pool, jobs)
+
+    def _collect(self, pool, jobs):
+        outcomes = [None] * len(jobs)
+        futures = {}
+        for number, job in enumerate(jobs):
+            try:
+                futures[pool.submit(_work, job)] = number
+            except RuntimeError as error:  # the pool has broken
+                self._errors.append(error)
+        bar = _bar(len(jobs)) if self.progress_bar else None
+        for future in as_completed(futures):
+            try:
+                outcomes[futures[future]] = future.result()
+            except Exception as error:  # noqa: BLE001 a worker may die of any
+                self._errors.append(error)
+            if bar is not None:
+                _advance(bar, outcomes)
+        if bar is not None:
+            bar.close()
+        return outcomes
+
+    def _report(self, done, stars):
+        widths = np.concatenate([o.widths for o in done]) if done else []
+        n_pixels = sum(o.n_pixels for o in done)
+        chi2 = sum(o.chi2 for o in done) / max(n_pixels, 1)
+        # Undetected companions broaden stars: look at those least broadened.
+        width = (float(np.percentile(widths, 25)) if len(widths) >= 5
+                 else np.nan)
+        if abs(width) > _WIDTH_TOLERANCE:
+            word = 'narrow' if width > 0 else 'wide'
+            warnings.warn(f'the PSF is too {word}: the variance of the light '
+                          f'of bright stars differs by {width:+.0%}',
+                          AstropyUserWarning, stacklevel=3)
+        return {'n_stars': len(stars), 'reduced_chi2': chi2,
+                'psf_size_difference': width}
+
+    def make_model_image(self, shape, *, psf_shape=None,
+                         include_local_bkg=False):
+        """
+        Draw the stars of the last table.
+
+        Parameters
+        ----------
+        shape : (ny, nx) tuple of int
+            The shape of the image.
+        psf_shape : int or (ny, nx) tuple of int, optional
+            How much of each star is drawn; by default all that can be seen.
+        include_local_bkg : bool, optional
+            Whether to add the background, as interpolated from the nearest
+            star.
+
+        Returns
+        -------
+        (ny, nx) `~numpy.ndarray` or `~astropy.units.Quantity`
+
+        Raises
+        ------
+        ValueError
+            If there is no table yet.
+        """
+        if self.results is None:
+            msg = 'make_model_image needs stars: call the object first'
+            raise ValueError(msg)
+        shape = as_shape(shape, 'shape')
+        table = self.results
+        flux = np.asarray(getattr(table['flux_fit'], 'value',
+                                  table['flux_fit']), float)
+        image = _draw(self._psf, table['x_fit'], table['y_fit'], flux, shape,
+                      psf_shape)
+        if include_local_bkg and len(table):
+            image += _nearest_background(table, shape)
+        unit = getattr(table['flux_fit'], 'unit', None)
+        return image if unit is None else image * unit
+
+    def make_residual_image(self, data, *, psf_shape=None,
+                            include_local_bkg=False):
+        """
+        Subtract the stars of the last table from an image.
+
+        Parameters
+        ----------
+        data : (ny, nx) array_like
+            The image.
+        psf_shape, include_local_bkg
+            See `make_model_image`.
+
+        Returns
+        -------
+        (ny, nx) `~numpy.ndarray` or `~astropy.units.Quantity`
+        """
+        data = getattr(data, 'data', data) if isinstance(
+            data, NDData) else data
+        return data - self.make_model_image(
+            np.shape(data), psf_shape=psf_shape,
+            include_local_bkg=include_local_bkg)
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """What comes back from a worker."""
+
+    stars: StarTable
+    chi2: float
+    n_pixels: int
+    widths: np.ndarray
+
+
+def _work(job):
+    tile = solve_tile(job)
+    chi = tile.weight * tile.residual**2
+    return _Outcome(tabulate(tile, job.core), float(chi.sum()),
+                    int(tile.good.sum()), tile.widths)
+
+
+def _local_psf(model):
+    grid = getattr(model, '_grid', None)
+    if grid is not None:
+        return LocalPSF.from_nodes(
+            grid.x_grid, grid.y_grid, grid.weights * grid.scales[:, None],
+            grid.means, grid.covariances, model.pixel_integrated)
+    mixture = getattr(model, 'mixture', None)
+    if mixture is None:
+        msg = ('psf_model must be a GriddedMixturePSF or a '
+               f'MultiGaussianPSFModel, got {model!r:.80}')
+        raise TypeError(msg)
+    return LocalPSF.from_nodes(
+        np.zeros(1), np.zeros(1), mixture.weights[None],
+        mixture.means[None], mixture.covariances[None],
+        bool(model.pixel_integrated))
+
+
+def _cores(shape, tile_shape):
+    """Return (y_low, y_high, x_low, x_high) of each tile."""
+    ny, nx = shape
+    ty, tx = tile_shape
+    return [(y, min(y + ty, ny), x, min(x + tx, nx))
+            for y in range(0, ny, ty) for x in range(0, nx, tx)]
+
+
+def _job(image, psf, options, core, overlap, given):
+    ny, nx = image.data.shape
+    margin = options.background_size or 0
+    y_low, y_high = _window(core[:2], ny, overlap, margin)
+    x_low, x_high = _window(core[2:], nx, overlap, margin)
+    window = slice(y_low, y_high), slice(x_low, x_high)
+    # The outermost tiles also own the stars just outside the image.
+    core = (core[0] or -overlap,
+            core[1] if core[1] < ny else ny + overlap,
+            core[2] or -overlap,
+            core[3] if core[3] < nx else nx + overlap)
+    part = None
+    if given is not None:
+        x, y, flux, number = given
+        near = ((x > x_low - 1) & (x < x_high) & (y > y_low - 1)
+                & (y < y_high))
+        part = np.array([x[near] - x_low, y[near] - y_low, flux[near],
+                         number[near]])
+    return TileJob(np.ascontiguousarray(image.data[window]),
+                   np.ascontiguousarray(image.variance[window]),
+                   psf.moved(x_low, y_low), options, (y_low, x_low), core,
+                   part)
+
+
+def _window(core, size, overlap, spacing):
+    """
+    Return which pixels a tile sees along an axis.
+
+    It sees all of those that the background nodes around its core rest on.
+    """
+    low, high = core[0] - overlap, core[1] + overlap
+    if spacing:
+        low = min(low, (core[0] // spacing - 0.5) * spacing)
+        high = max(high, (-(-core[1] // spacing) + 0.5) * spacing)
+    return max(0, int(np.floor(low))), min(size, int(np.ceil(high)) + 1)
+
+
+def _clipped(core, shape):
+    y, x = np.clip(core[:2], 0, shape[0]), np.clip(core[2:], 0, shape[1])
+    return tuple(int(v) for v in (*y, *x))
+
+
+def _given(table):
+    """Return x, y, flux (NaN if unknown) and the row of each position."""
+    table = Table(table)
+    found = {}
+    for key, names in _NAMES.items():
+        name = next((n for n in names if n in table.colnames), None)
+        if name is None and key != 'flux':
+            msg = (f'init_params must have a column {names[0]}, got '
+                   f'{table.colnames}')
+            raise ValueError(msg)
+        column = np.full(len(table), np.nan) if name is None else table[name]
+        column = np.ma.filled(np.ma.asarray(
+            getattr(column, 'value', column), float), np.nan)
+        found[key] = np.asarray(column, float)
+    return found['x'], found['y'], found['flux'], np.arange(len(table))
+
+
+def _in_given_order(stars, given):
+    """Return one row for each position; NaN where nothing was fitted."""
+    x, y, flux, _ = given
+    n = x.size
+    columns = {}
+    for name, column in stars.columns.items():
+        fill = np.nan if column.dtype.kind == 'f' else 0
+        columns[name] = np.full(n, fill, column.dtype)
+        columns[name][stars.columns['number']] = column
+    missing = np.ones(n, bool)
+    missing[stars.columns['number']] = False
+    columns['flags'][missing] |= 16 | 64
+    columns['x_init'], columns['y_init'] = x, y
+    known = np.isfinite(flux)
+    columns['flux_init'] = np.where(known, flux, columns['flux_init'])
+    return StarTable(columns)
+
+
+def _draw(psf, x, y, flux, shape, psf_shape):
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    good = np.isfinite(x) & np.isfinite(y) & np.isfinite(flux)
+    x, y, flux = x[good], y[good], flux[good]
+    image = np.zeros(shape)
+    if psf_shape is None:
+        wing = np.full(x.size, 30)
+    else:
+        wing = np.full(x.size, max(as_shape(psf_shape, 'psf_shape')) // 2)
+    one = np.ones(x.size, np.int64)
+    rows, count = psf.rows_at(x, y)
+    left, bottom = (np.rint(v).astype(np.int64) for v in (x, y))
+    _kernels.add_stars(np.arange(x.size), 1.0, x, y, flux, left, bottom, one,
+                       0 * one, wing.astype(np.int64), np.empty((3, 1)),
+                       rows, count, psf.integrated, image)
+    return image
+
+
+def _nearest_background(table, shape):
+    from scipy.spatial import cKDTree
+    level = table['local_bkg']
+    level = np.asarray(getattr(level, 'value', level), float)
+    good = np.isfinite(level) & np.isfinite(table['x_fit'])
+    tree = cKDTree(np.column_stack([table['x_fit'][good],
+                                    table['y_fit'][good]]))
+    y, x = np.indices(shape)
+    nearest = tree.query(np.column_stack([x.ravel(), y.ravel()]))[1]
+    return level[good][nearest].reshape(shape)
+
+
+def _bar(n):
+    from tqdm import tqdm
+    return tqdm(total=n, desc='tiles')
+
+
+def _advance(bar, outcomes):
+    done = [outcome for outcome in outcomes if outcome is not None]
+    chi2 = sum(o.chi2 for o in done) / max(sum(o.n_pixels for o in done), 1)
+    bar.set_postfix(stars=sum(len(o.stars) for o in done),
+                    chi2=f'{chi2:.2f}')
+    bar.update()
+
+
+def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
+                       separation=20, radius=0.7, flux_ratio=2.5,
+                       flux_edges=None, effective_gain=1.0, repeats=1,
+                       rng=None):
+    """
+    Add artificial stars to an image and see what is found of them.
+
+    The stars are drawn with the PSF of ``photometry``, with the noise of
+    their own light, on a jittered lattice so wide that they do not crowd one
+    another, and the image is reduced again as before.
+
+    Parameters
+    ----------
+    photometry : CrowdedMixturePhotometry
+        How the image is reduced.
+    data : (ny, nx) array_like
+        The image.
+    flux : (n,) array_like or (low, high) tuple of float
+        The fluxes of the stars of one repeat, or limits between which they
+        are drawn evenly in the logarithm, as many as there is room for.
+    mask, error
+        As in `CrowdedMixturePhotometry.__call__`.
+    separation : float, optional
+        The distance of artificial stars [pix].
+    radius : float, optional
+        How far from its place a star may be found [pix].
+    flux_ratio : float, optional
+        By which factor its flux may be off.
+    flux_edges : (m + 1,) array_like, optional
+        The edges of the bins of flux; by default about a magnitude wide.
+    effective_gain : float, optional
+        Electrons per unit of data, for the noise of the artificial stars.
+    repeats : int, optional
+        How often to do it.
+    rng : `~numpy.random.Generator` or int, optional
+        Randomness, or a seed.
+
+    Returns
+    -------
+    InjectionResult
+        With the tables ``stars`` and ``curves``.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not valid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from photutils_mgauss import (CrowdedMixturePhotometry,
+    ...                               GaussianMixture, GriddedMixturePSF,
+    ...                               inject_and_recover)
+    >>> mixture = GaussianMixture([1], [[0, 0]], [[[0.7, 0], [0, 0.8]]])
+    >>> phot = CrowdedMixturePhotometry(GriddedMixturePSF([mixture],
+    ...                                                   [(0, 0)]))
+    >>> data = np.random.default_rng(1).normal(100, 10, (60, 60))
+    >>> result = inject_and_recover(phot, data, (3000, 9000), rng=2,
+    ...                             error=np.full((60, 60), 10.0))
+    >>> result.curves['completeness']
+    <Column name='completeness' dtype='float64' length=1>
+    1.0
+    """
+    rng = np.random.default_rng(rng)
+    image = Image.of(data, error, mask)
+    gain = as_real(effective_gain, 'effective_gain', above=0)
+    repeats = as_integer(repeats, 'repeats', minimum=1)
+    separation = as_real(separation, 'separation', minimum=5)
+    before = photometry(data, mask=mask, error=error)
+    known = _positions(before)
+    tables = []
+    for _ in range(repeats):
+        true = _artificial(image, flux, separation, rng)
+        light = _draw(photometry._psf, *true, image.data.shape, None)
+        noisy = rng.poisson(np.maximum(light, 0) * gain) / gain
+        variance = image.variance + light / gain
+        table = photometry(
+            image.data + noisy, mask=image.variance == 0,
+            error=np.sqrt(np.where(image.variance > 0, variance, 1)))
+        row = injection.match(true, _positions(table), known, radius,
+                              flux_ratio)
+        tables.append(_injected(true, table, row))
+    photometry.results = before
+    stars = vstack(tables)
+    if flux_edges is None:
+        flux_edges = _flux_edges(np.asarray(stars['flux_true']))
+    return InjectionResult(stars, injection.curves(stars, flux_edges))
+
+
+def _artificial(image, flux, separation, rng):
+    """Draw x, y and flux of the artificial stars of one repeat."""
+    limits = isinstance(flux, tuple)
+    flux = np.atleast_1d(as_floats(flux, 'flux'))
+    if not (flux > 0).all():
+        msg = f'flux must be positive, got {flux.min()}'
+        raise ValueError(msg)
+    n = image.data.size if limits else flux.size
+    x, y = injection.place_stars(image.data.shape, image.variance == 0, n,
+                                 separation, rng)
+    if limits:
+        flux = np.exp(rng.uniform(*np.log(flux), x.size))
+    elif x.size < flux.size:
+        msg = (f'flux must not hold more stars than fit {separation} pixels '
+               f'apart, {x.size}, got {flux.size}')
+        raise ValueError(msg)
+    return x, y, flux
+
+
+def _positions(table):
+    return tuple(np.asarray(getattr(table[name], 'value', table[name]), float)
+                 for name in ('x_fit', 'y_fit', 'flux_fit'))
+
+
+def _injected(true, table, row):
+    out = QTable(dict(zip(('x_true', 'y_true', 'flux_true'), true,
+                          strict=True)))
+    found = row >= 0
+    out['recovered'] = found
+    for name in ('x_fit', 'y_fit', 'flux_fit', 'x_err', 'y_err', 'flux_err'):
+        column = np.full(row.size, np.nan)
+        values = getattr(table[name], 'value', table[name])
+        column[found] = np.asarray(values, float)[row[found]]
+        out[name] = column
+    out['flags'] = np.zeros(row.size, int)
+    out['flags'][found] = np.asarray(table['flags'])[row[found]]
+    return out
+
+
+def _flux_edges(flux):
+    n = max(1, round(2.5 * np.log10(flux.max() / flux.min())))
+    return np.geomspace(flux.min(), flux.max() * (1 + 1e-9), n + 1)

@@ -1,0 +1,369 @@
+"""Crowded fields: laws of the joint fit, of finding, and of tiles."""
+from concurrent.futures import Executor, Future
+
+import numpy as np
+import pytest
+from astropy import units as u
+from astropy.nddata import NDData, StdDevUncertainty
+from astropy.table import Table
+from numpy.testing import assert_allclose
+from scipy.spatial import cKDTree
+
+from photutils_mgauss import (
+    CrowdedMixturePhotometry,
+    GaussianMixture,
+    GriddedMixturePSF,
+    MultiGaussianPSFModel,
+    UnfinishedTilesError,
+    _kernels,
+    inject_and_recover,
+)
+from photutils_mgauss._crowded_stars import Neighbours, Stars
+from photutils_mgauss._crowded_tile import Tile, TileJob, TileOptions
+from photutils_mgauss._local_psf import LocalPSF
+
+MIXTURE = GaussianMixture([0.8, 0.2], [[0, 0], [0.1, 0]],
+                          [[[0.6, 0.05], [0.05, 0.5]], [[3, 0], [0, 3]]])
+PSF = GriddedMixturePSF([MIXTURE], [(0, 0)])
+OPTIONS = TileOptions(threshold=4.5, keep=2.5, background_size=64,
+                      psf_error=0.0, gain=None, floor=1.0, max_rounds=6)
+
+
+def photometry(**kwargs):
+    return CrowdedMixturePhotometry(PSF, **kwargs)
+
+
+def draw(x, y, flux, shape, level=20.0):
+    image = np.full(shape, level)
+    for a, b, f in zip(x, y, flux, strict=True):
+        image += MIXTURE.render(shape, a, b, flux=f)
+    return image
+
+
+def expose(image, seed):
+    """Return data and error with photon and read-out noise."""
+    rng = np.random.default_rng(seed)
+    data = rng.poisson(image) + rng.normal(0, 5, image.shape)
+    return data, np.sqrt(np.clip(data, 0, None) + 25)
+
+
+@pytest.fixture(scope='module')
+def crowd():
+    """Return a field of one star for every 30 pixels, and its truth."""
+    rng = np.random.default_rng(5)
+    shape = (120, 140)
+    n = 560
+    x, y = rng.uniform(-0.5, 139.5, n), rng.uniform(-0.5, 119.5, n)
+    flux = 10**rng.uniform(2.7, 5, n)
+    data, error = expose(draw(x, y, flux, shape), 6)
+    return data, error, x, y, flux
+
+
+@pytest.fixture(scope='module')
+def fitted(crowd):
+    return photometry()(crowd[0], error=crowd[1])
+
+
+def nearest(table, x, y):
+    tree = cKDTree(np.column_stack([table['x_fit'], table['y_fit']]))
+    return tree.query(np.column_stack([x, y]))
+
+
+def small_tile(x, y, flux, noise=1.0):
+    data = draw(x, y, flux, (31, 31), level=5.0)
+    local = LocalPSF.from_nodes(
+        np.zeros(1), np.zeros(1), MIXTURE.weights[None], MIXTURE.means[None],
+        MIXTURE.covariances[None], False)
+    return Tile(TileJob(data, np.full(data.shape, noise**2), local, OPTIONS,
+                        (0, 0), (0, 31, 0, 31)))
+
+
+def test_stamps_hold_the_psf_and_its_derivatives():
+    tile = small_tile([], [], [])
+    tile.stars = Stars([12.3], [14.6], [1.0], n_rows=tile.psf.n_rows)
+    tile.refresh()
+    w = tile.width[0]
+    jets = tile.jets.reshape(3, w, w)
+    model = MultiGaussianPSFModel(MIXTURE)
+    j, i = np.indices((w, w))
+    exact = model.fit_deriv(i + tile.left[0], j + tile.bottom[0], 1, 12.3,
+                            14.6, *model.parameters[3:])[:3]
+    assert_allclose(jets, exact, atol=1e-14)
+
+
+def test_the_joint_normal_matrix_is_that_of_the_dense_problem():
+    x, y, flux = [12.3, 14.1, 15.2], [14.6, 15.4, 13.2], [900., 500., 300.]
+    tile = small_tile(x, y, flux)
+    tile.stars = Stars(x, y, flux, n_rows=tile.psf.n_rows)
+    tile.refresh()
+    columns = []
+    for k in range(3):
+        w = tile.width[k]
+        stamp = tile.jets[:, tile.offset[k]:tile.offset[k] + w * w]
+        for m, scale in enumerate((1, flux[k], flux[k])):
+            plane = np.zeros(tile.data.shape)
+            plane[tile.bottom[k]:tile.bottom[k] + w,
+                  tile.left[k]:tile.left[k] + w] = scale * stamp[m].reshape(
+                      w, w)
+            columns.append(plane.ravel())
+    design = np.array(columns)
+    dense = np.linalg.inv(design @ design.T)
+    covariance, correlation = tile.covariances()
+    for k in range(3):
+        block = slice(3 * k, 3 * k + 3)
+        assert_allclose(covariance[k], dense[block, block], rtol=1e-9)
+        other = 3 * tile.pairs.nearest[k]
+        want = dense[3 * k, other] / np.sqrt(dense[3 * k, 3 * k]
+                                             * dense[other, other])
+        assert_allclose(correlation[k], want, rtol=1e-9)
+
+
+def test_gauss_newton_finds_a_noiseless_blend_again():
+    x, y = np.array([12.3, 13.5, 15.2]), np.array([14.6, 15.3, 13.2])
+    flux = np.array([9000.0, 5000.0, 300.0])
+    tile = small_tile(x, y, flux)
+    tile.stars = Stars(x + 0.15, y - 0.1, 0.8 * flux, n_rows=tile.psf.n_rows)
+    tile.refresh()
+    for _ in range(40):
+        tile.step(1e-8)
+    assert_allclose(tile.stars.x, x, atol=2e-3)
+    assert_allclose(tile.stars.flux, flux, rtol=2e-3)
+    assert_allclose(tile.level, 5, atol=0.02)
+
+
+def test_neighbours_are_listed_both_ways():
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(0, 30, (2, 60))
+    pairs = Neighbours.of(x, y)
+    assert (pairs.owner[pairs.twin] == pairs.neighbour).all()
+    assert (pairs.neighbour[pairs.twin] == pairs.owner).all()
+
+
+def test_merged_gaussians_are_the_blend_of_the_grid():
+    shapes = [0.6, 0.61, 0.605, 0.62]
+    nodes = [GaussianMixture([0.7 + i / 100, 0.3 - i / 100],
+                             [[0.01 * i, 0], [0, 0]],
+                             [[[s, 0], [0, s]], [[3, 0], [0, 3 + s]]])
+             for i, s in enumerate(shapes)]
+    # The order of Gaussians is arbitrary.
+    flipped = [GaussianMixture(m.weights[::-1], m.means[::-1],
+                               m.covariances[::-1]) for m in nodes[:1]]
+    psf = GriddedMixturePSF(flipped + nodes[1:],
+                            [(0, 0), (50, 0), (0, 50), (50, 50)])
+    phot = CrowdedMixturePhotometry(psf)
+    assert phot._psf.n_rows == 2
+    stamp = phot._psf.stamp(22, 31, 6)
+    exact = psf.render(22, 31, 1, 13)[0]
+    assert_allclose(stamp, exact, atol=1e-3 * exact.max())
+
+
+def test_stars_are_found_and_false_ones_are_rare(crowd, fitted):
+    _, _, x, y, flux = crowd
+    distance, row = nearest(fitted, x, y)
+    bright = flux > 5000
+    matched = (distance < 0.5) & (np.abs(np.log(
+        fitted['flux_fit'][row] / flux)) < 0.7)
+    assert matched[bright].mean() > 0.96
+    tree = cKDTree(np.column_stack([x, y]))
+    gap, _ = tree.query(np.column_stack([fitted['x_fit'], fitted['y_fit']]))
+    assert (gap > 0.7).mean() < 0.06
+
+
+def test_errors_are_honest(crowd, fitted):
+    _, _, x, y, flux = crowd
+    distance, row = nearest(fitted, x, y)
+    good = (distance < 0.5) & (flux > 2000)
+    pull = np.concatenate([
+        (fitted[f'{c}_fit'][row] - true)[good] / fitted[f'{c}_err'][row][good]
+        for c, true in (('x', x), ('y', y))])
+    assert 0.8 < 1.4826 * np.median(np.abs(pull)) < 1.4
+
+
+def test_the_background_is_that_of_the_sky(fitted):
+    assert abs(np.median(fitted['local_bkg']) - 20) < 4
+
+
+def test_the_table_has_the_columns_of_photutils(fitted):
+    assert {'id', 'group_id', 'group_size', 'local_bkg', 'x_init', 'y_init',
+            'flux_init', 'x_fit', 'y_fit', 'flux_fit', 'x_err', 'y_err',
+            'flux_err', 'n_pixels_fit', 'qfit', 'cfit', 'reduced_chi2',
+            'flags'} <= set(fitted.colnames)
+    assert ((fitted['crowding'] > 0) & (fitted['crowding'] <= 1)).all()
+    assert (np.abs(fitted['neighbor_correlation']) <= 1).all()
+
+
+def test_tiles_do_not_change_a_star(crowd, fitted):
+    table = photometry(tile_shape=(70, 64))(crowd[0], error=crowd[1])
+    distance, _ = nearest(table, fitted['x_fit'], fitted['y_fit'])
+    assert len(table) == pytest.approx(len(fitted), abs=4)
+    assert (distance < 1e-3).mean() > 0.95
+    sigma = distance / np.hypot(fitted['x_err'], fitted['y_err'])
+    assert np.percentile(sigma, 97) < 0.1
+
+
+def test_the_residual_image_is_noise(crowd):
+    data, error = crowd[:2]
+    phot = photometry()
+    phot(data, error=error)
+    residual = phot.make_residual_image(data, include_local_bkg=True)
+    chi = (residual / error)[12:-12, 12:-12]
+    assert 1.4826 * np.median(np.abs(chi)) < 1.15
+
+
+def test_given_positions_are_fitted_in_their_order(crowd):
+    data, error, x, y, flux = crowd
+    bright = np.flatnonzero((flux > 3000) & (x > 2) & (y > 2) & (x < 137)
+                            & (y < 117))
+    init = Table({'x': x[bright] + 0.1, 'y': y[bright]})
+    table = photometry(tile_shape=80)(data, error=error, init_params=init)
+    assert len(table) == len(init)
+    assert_allclose(table['x_init'], init['x'])
+    gap = np.hypot(table['x_fit'] - x[bright], table['y_fit'] - y[bright])
+    assert np.median(gap) < 0.05
+
+
+def test_noise_alone_holds_no_stars():
+    rng = np.random.default_rng(2)
+    table = photometry()(rng.normal(50, 7, (150, 150)),
+                         error=np.full((150, 150), 7.0))
+    assert len(table) <= 1
+
+
+@pytest.mark.parametrize('mask', [True, False])
+def test_an_image_without_pixels_gives_an_empty_table(mask):
+    data = np.full((40, 40), 1.0 if mask else np.nan)
+    table = photometry()(data, error=np.ones((40, 40)),
+                         mask=np.full((40, 40), mask))
+    assert len(table) == 0
+    assert 'x_fit' in table.colnames
+
+
+def test_nan_borders_are_left_out(crowd, fitted):
+    data, error = crowd[0].copy(), crowd[1]
+    data[:, :20] = np.nan
+    table = photometry()(data, error=error)
+    inner = fitted[fitted['x_fit'] > 40]
+    distance, _ = nearest(table, inner['x_fit'], inner['y_fit'])
+    assert (distance < 0.01).mean() > 0.9
+
+
+def test_a_saturated_star_is_one_star():
+    image = draw([30.3, 12.0], [31.1, 45.0], [3e6, 5e4], (62, 62))
+    data, error = expose(image, 3)
+    mask = data > 9e4
+    table = photometry()(np.minimum(data, 9e4), error=error, mask=mask)
+    near = np.hypot(table['x_fit'] - 30.3, table['y_fit'] - 31.1) < 12
+    star = table[near][np.argmax(table[near]['flux_fit'])]
+    assert near.sum() <= 2
+    assert abs(star['flux_fit'] / 3e6 - 1) < 0.05
+    assert star['flags'] & 65536
+
+
+def test_a_galaxy_is_flagged_if_it_is_taken_for_stars():
+    y, x = np.indices((90, 90))
+    galaxy = 4000 * np.exp(-np.hypot(x - 45, (y - 44) / 0.6) / 6)
+    data, error = expose(20 + galaxy, 4)
+    table = photometry()(data, error=error)
+    assert len(table) < 500
+    flagged = table['flags'] & (262144 | 8) > 0
+    assert flagged.sum() > 0.6 * len(table)
+
+
+@pytest.mark.parametrize(('factor', 'word'), [(1.8, 'wide'), (0.5, 'narrow')])
+def test_a_wrong_psf_is_reported(crowd, factor, word):
+    wrong = GaussianMixture(MIXTURE.weights, MIXTURE.means,
+                            factor * MIXTURE.covariances)
+    phot = CrowdedMixturePhotometry(GriddedMixturePSF([wrong], [(0, 0)]),
+                                    maxiters=1)
+    with pytest.warns(UserWarning, match=f'too {word}'):
+        phot(crowd[0][:70, :70], error=crowd[1][:70, :70])
+
+
+def test_units_pass_through(crowd):
+    data, error = crowd[0][:50, :50], crowd[1][:50, :50]
+    plain = photometry()(data, error=error)
+    table = photometry()(data * u.electron, error=error * u.electron)
+    assert table['flux_fit'].unit == u.electron
+    assert_allclose(table['flux_fit'].value, plain['flux_fit'])
+    nddata = NDData(data, uncertainty=StdDevUncertainty(error))
+    assert_allclose(photometry()(nddata)['x_fit'], plain['x_fit'])
+
+
+class DyingExecutor(Executor):
+    """Runs the first job and fails the others, as a killed worker does."""
+
+    def __init__(self):
+        self.n = 0
+
+    def submit(self, function, *args):
+        future = Future()
+        self.n += 1
+        if self.n == 1:
+            future.set_result(function(*args))
+        else:
+            future.set_exception(RuntimeError('killed'))
+        return future
+
+
+def test_a_killed_worker_leaves_the_finished_tiles(crowd):
+    phot = photometry(tile_shape=70, executor=DyingExecutor())
+    with pytest.raises(UnfinishedTilesError, match='3 tiles') as caught:
+        phot(crowd[0], error=crowd[1])
+    assert len(caught.value.table) > 50
+    assert (0, 70, 70, 140) in caught.value.unfinished
+
+
+@pytest.mark.parametrize(('keyword', 'value', 'error'), [
+    ('threshold', -1, ValueError), ('keep', 'x', TypeError),
+    ('background_size', 2, ValueError), ('tile_shape', 5, ValueError),
+    ('overlap', 2, ValueError), ('maxiters', 0, ValueError)])
+def test_bad_keywords_are_named(keyword, value, error):
+    with pytest.raises(error, match=keyword):
+        photometry(**{keyword: value})
+
+
+def test_bad_images_are_named():
+    with pytest.raises(ValueError, match='data must have'):
+        photometry()(np.ones(5))
+    with pytest.raises(ValueError, match='error must have'):
+        photometry()(np.ones((50, 50)), error=np.ones((5, 5)))
+    with pytest.raises(TypeError, match='psf_model'):
+        CrowdedMixturePhotometry('psf')
+    with pytest.raises(ValueError, match='y_init'):
+        photometry()(np.ones((50, 50)), init_params=Table({'x': [1]}))
+
+
+def test_bright_artificial_stars_come_back(crowd):
+    result = inject_and_recover(photometry(), crowd[0], (2e3, 6e4), rng=1,
+                                error=crowd[1], separation=25)
+    stars = result.stars
+    assert stars['recovered'][stars['flux_true'] > 1e4].mean() > 0.9
+    assert (result.curves['n_injected'].sum() == len(stars))
+    again = inject_and_recover(photometry(), crowd[0], (2e3, 6e4), rng=1,
+                               error=crowd[1], separation=25)
+    assert_allclose(again.stars['x_fit'], stars['x_fit'])
+
+
+def test_the_solution_of_conjugate_gradients_solves_the_equations():
+    rng = np.random.default_rng(4)
+    n = 5
+    a = rng.normal(size=(3 * n + 4, 40))
+    full = a @ a.T
+    matrix = np.array([full[3*i:3*i + 3, 3*i:3*i + 3] for i in range(n)])
+    i, j = np.nonzero(~np.eye(n, dtype=bool))
+    blocks = np.array([full[3*p:3*p + 3, 3*q:3*q + 3]
+                       for p, q in zip(i, j, strict=True)])
+    indptr = np.arange(n + 1) * (n - 1)
+    node = np.tile(np.arange(4), (n, 1))
+    reach = rng.normal(size=(n, 3))
+    share = np.full((n, 4), 0.25)
+    full[:15, 15:] = np.repeat(reach.ravel()[:, None] / 4, 4, axis=1)
+    full[15:, :15] = full[:15, 15:].T
+    right = rng.normal(size=3 * n + 4)
+    step, level = np.empty((n, 3)), np.empty(4)
+    _kernels.solve_joint(
+        matrix, right[:15].reshape(n, 3).copy(), indptr, j.astype(np.int64),
+        blocks, node, share, reach, full[15:, 15:].copy(), right[15:].copy(),
+        1e-12, 200, step, level)
+    assert_allclose(np.concatenate([step.ravel(), level]),
+                    np.linalg.solve(full, right), rtol=1e-6)
