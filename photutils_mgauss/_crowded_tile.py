@@ -240,8 +240,8 @@ class Tile:
         self.blocks = np.empty((p.neighbour.size, 3, 3))
         self.mesh_gradient = np.zeros(m)
         place = (*self._place(), self.jets)
-        _kernels.star_equations(s.flux, *place, self.weight, self.residual,
-                                self.matrix, self.gradient, self.reach)
+        _kernels.own_equations(s.flux, *place, self.weight, self.residual,
+                               self.matrix, self.gradient, self.reach)
         _kernels.pair_blocks(p.indptr, p.neighbour, p.twin, s.flux, *place,
                              self.weight, self.blocks)
         information = np.zeros(m)

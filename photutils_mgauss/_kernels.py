@@ -2953,8 +2953,8 @@ def add_stars(chosen, sign, x, y, flux, left, bottom, width, offset, wing,
 
 
 @_jit
-def star_equations(flux, left, bottom, width, offset, jets, weight, residual,
-                   matrix, gradient, reach):
+def own_equations(flux, left, bottom, width, offset, jets, weight, residual,
+                  matrix, gradient, reach):
     """
     Put each star's own normal equations into matrix (n, 3, 3), gradient.
 

@@ -99,6 +99,9 @@ def is_fixed_shape(model):
     """Return whether the kernels can fit all that is free in a model."""
     if not isinstance(model, (GriddedMixturePSF, MultiGaussianPSFModel)):
         return False
+    if isinstance(model, GriddedMixturePSF) and (
+            model.interpolation, model.outside) != ('blend', 'clamp'):
+        return False
     return all(getattr(model, name).fixed for name in model.param_names[3:])
 
 

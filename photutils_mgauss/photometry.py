@@ -40,8 +40,9 @@ class MixturePSFPhotometry(PSFPhotometry):
     ----------
     psf_model : GriddedMixturePSF, MultiGaussianPSFModel or MixtureField
         The PSF. Parameters that are ``fixed`` are not fitted: with ``x_0``
-        and ``y_0`` fixed the photometry is forced. Any other PSF model, and
-        a model whose shape is free, is handed to
+        and ``y_0`` fixed the photometry is forced. Any other PSF model, a
+        model whose shape is free, and a grid with another ``interpolation``
+        than 'blend' or ``outside`` than 'clamp' is handed to
         `~photutils.psf.PSFPhotometry`.
     fit_shape : int or (ny, nx) tuple of int
         The shape of the fitted region, odd.
