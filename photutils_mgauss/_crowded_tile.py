@@ -30,7 +30,7 @@ _MIN_HALF, _MAX_HALF, _BRIGHT_HALF = 3, 4, 6
 _BRIGHT_FLUX = 300
 # A star is drawn out to where its surface brightness falls below this
 # fraction of the noise.
-_WING_NOISE = 0.1
+_WING_NOISE = 0.2
 # A step of Gauss-Newton moves a star no further than this [pix].
 _MAX_MOVE = 0.4
 # Nor does it change a flux by more than these factors.

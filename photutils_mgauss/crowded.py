@@ -152,7 +152,7 @@ class CrowdedMixturePhotometry:
 
     def __init__(self, psf_model, *, threshold=4.5, keep=2.5,
                  background_size=64, psf_error=0.01, effective_gain=None,
-                 maxiters=4, tile_shape=512, overlap=48, executor=None,
+                 maxiters=3, tile_shape=512, overlap=48, executor=None,
                  progress_bar=False):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
