@@ -233,7 +233,7 @@ def bench_parallax_bias():
 def bench_joint_and_two_step():
     heading('Joint over two-step, rms error by formal position error')
     sums = {}
-    for seed in range(10):
+    for seed in range(60):
         rng = np.random.default_rng(50 + seed)
         truth = make_truth(rng, n_stars=1500, n_qso=60,
                            sigma=10 ** rng.uniform(-0.3, 1, 1560))
