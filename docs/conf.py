@@ -9,6 +9,8 @@ otherwise.
 """
 import datetime as dt
 import os
+import sys
+from pathlib import Path
 
 from sphinx_astropy.conf.v3 import *
 
@@ -21,10 +23,13 @@ project_copyright = f'{_year}, {author}'
 release = photutils_mgauss.__version__
 version = '.'.join(release.split('.')[:2])
 
+sys.path.insert(0, str(Path(__file__).parent))
 extensions.remove('sphinx.ext.todo')
+extensions.append('make_gallery')
 exclude_patterns = ['_build', '**.ipynb_checkpoints']
 html_title = f'{project} {release}'
-html_static_path = []
+html_static_path = ['_static']
+html_css_files = ['mgauss.css']
 html_theme_options = {}
 modindex_common_prefix = ['photutils_mgauss.']
 

@@ -148,7 +148,18 @@ class Epoch:
         return float(np.nanmean(self.years))
 
     def with_wcs(self, wcs):
-        """Return this epoch with another WCS."""
+        """
+        Return this epoch with another WCS.
+
+        Parameters
+        ----------
+        wcs : APE 14 WCS or None
+            The new one.
+
+        Returns
+        -------
+        Epoch
+        """
         return replace(self, wcs=wcs)
 
 

@@ -82,6 +82,12 @@ def barycentric_observer(name, time, *, velocity=False):
         ICRS place [au], with a `~astropy.coordinates.CartesianDifferential`
         where a velocity was asked for.
 
+    Raises
+    ------
+    ValueError
+        If the name is not known, or the velocity of a low orbit is asked
+        for.
+
     Examples
     --------
     >>> from photutils_mgauss import barycentric_observer

@@ -41,6 +41,21 @@ class SimulatedCatalogue:
         From pixels to ICRS.
     time : `~astropy.time.Time`
         The middle of the exposure, TDB.
+
+    Examples
+    --------
+    It has what an `Epoch` is made of:
+
+    >>> from photutils_mgauss import (
+    ...     Epoch, Instrument, paper_exposures, simulate_catalogues, sky_field)
+    >>> sources = sky_field(20, 10, size=0.25, rng=1, magnitudes=(20, 24))
+    >>> (catalogue,) = simulate_catalogues(
+    ...     sources, paper_exposures()[1:2], rng=2,
+    ...     instrument=Instrument(shape=(300, 300)))
+    >>> catalogue
+    <SimulatedCatalogue: 30 sources at 2026.410>
+    >>> Epoch(catalogue.table, catalogue.wcs, catalogue.time)
+    <Epoch: 30 stars at 2026.410, gwcs WCS>
     """
 
     table: QTable

@@ -54,6 +54,12 @@ class Band:
     25.825
     >>> round(float(band.rate(25.0)), 3)
     2.138
+
+    ``CSST_BANDS`` is a dict of those the simulations know:
+
+    >>> from photutils_mgauss import CSST_BANDS
+    >>> list(CSST_BANDS), CSST_BANDS['i'].wavelengths
+    (['g', 'r', 'i'], (684.0, 842.0))
     """
 
     name: str

@@ -17,6 +17,8 @@ from photutils_mgauss._simulation_instrument import Band
 from photutils_mgauss._simulation_psf import band_of
 from photutils_mgauss._validation import as_integer, as_real, as_shape
 
+__doctest_requires__ = {'Optics': ['galsim']}
+
 # Noll's numbers of the aberrations: defocus, astigmatism, coma, trefoil and
 # spherical, and how strong each is in comparison.
 _NOLL = np.arange(4, 12)
@@ -55,6 +57,14 @@ class Optics:
         If galsim is not installed.
     ValueError
         If a value is out of range.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import Optics
+    >>> optics = Optics((200, 200), 'g', n_wavelengths=1)
+    >>> epsfs = optics.to_gridded_psf(2, radius=8)
+    >>> epsfs.data.shape  # nodes at the corners, two samples a pixel
+    (4, 65, 65)
     """
 
     shape: tuple

@@ -476,6 +476,11 @@ class GaussianMixture:
         -------
         GaussianMixture
 
+        Raises
+        ------
+        ValueError
+            If the offset is not two finite numbers.
+
         Examples
         --------
         >>> from photutils_mgauss import GaussianMixture

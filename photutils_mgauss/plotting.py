@@ -482,10 +482,10 @@ def plot_posterior(ax, posterior, name):
     `~matplotlib.axes.Axes`
         The same.
     """
-    for label, draws in _named_draws(posterior, name):
+    for i, (label, draws) in enumerate(_named_draws(posterior, name)):
         density, edges = np.histogram(draws, bins=40, density=True)
-        ax.stairs(density, edges, label=label)
-    ax.set(xlabel=name, ylabel='density')
+        ax.stairs(density, edges, color=_CYCLE[i % len(_CYCLE)], label=label)
+    ax.set(xlabel=_with_unit(name), ylabel='density')
     ax.legend()
     return ax
 
@@ -512,9 +512,14 @@ def plot_trace(ax, posterior, name):
         for c, chain in enumerate(draws):
             ax.plot(chain, color=_CYCLE[i % len(_CYCLE)], linewidth=0.4,
                     alpha=0.7, label=label if c == 0 else None)
-    ax.set(xlabel='draw', ylabel=name)
+    ax.set(xlabel='draw', ylabel=_with_unit(name))
     ax.legend()
     return ax
+
+
+def _with_unit(name):
+    """Return a label of the posterior's quantity: lengths are in pixels."""
+    return f'{name} [pix]' if name in ('alpha', 'beta') else name
 
 
 def _named_draws(posterior, name):
@@ -724,6 +729,7 @@ def plot_errors_by_epochs(ax, solutions):
         Where to draw.
     solutions : sequence of `~photutils_mgauss.MotionSolution`
         Fits to different numbers of epochs (as Fig. 11 of Nie et al.).
+        Their reference objects do not count.
 
     Returns
     -------
@@ -731,9 +737,11 @@ def plot_errors_by_epochs(ax, solutions):
         The same.
     """
     counts = [len(solution.epochs) for solution in solutions]
+    measured = [solution.stars[solution.stars['reference'] == '']
+                for solution in solutions]
     for name, colour in (('pmra', ORANGE), ('pmdec', BLUE)):
-        medians = [np.nanmedian(solution.stars[f'{name}_error'].value)
-                   for solution in solutions]
+        medians = [np.nanmedian(stars[f'{name}_error'].value)
+                   for stars in measured]
         ax.plot(counts, medians, 'o-', color=colour, label=name)
     unit = solutions[0].stars['pmra'].unit
     ax.set(xlabel='number of epochs', ylabel=f'median error [{unit}]')

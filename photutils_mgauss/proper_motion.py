@@ -109,6 +109,32 @@ class MotionSolution:
         the systematic error found.
     notes : tuple of str
         What the data could not determine, in sentences.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import (
+    ...     Epoch, Instrument, ProperMotionFitter, paper_exposures,
+    ...     simulate_catalogues, sky_field)
+    >>> sources = sky_field(30, 20, size=0.3, magnitudes=(20, 23),
+    ...                     parallaxes=False, separation=0.5, rng=1)
+    >>> epochs = [Epoch(one.table, one.wcs, one.time)
+    ...           for one in simulate_catalogues(
+    ...               sources, paper_exposures()[::3], rng=2,
+    ...               instrument=Instrument(shape=(400, 400)))]
+    >>> quasars = list(sources['id'][sources['kind'] == 'qso'])
+    >>> solution = ProperMotionFitter(references=quasars).fit(epochs)
+    >>> solution
+    <MotionSolution: 50 of 50 stars, 3 epochs>
+    >>> solution.stars['pmra', 'pmra_error', 'pmra_pmdec_corr'].colnames
+    ['pmra', 'pmra_error', 'pmra_pmdec_corr']
+    >>> solution.residuals['epoch', 'dra', 'ddec'].colnames
+    ['epoch', 'dra', 'ddec']
+
+    Positions at another time, with the errors of then:
+
+    >>> later = solution.at(2030.0)
+    >>> bool((later['ra_error'] > solution.stars['ra_error']).all())
+    True
     """
 
     stars: QTable
@@ -224,6 +250,11 @@ class MotionSolution:
             ``draws.shift`` (n_resamples, E, 2) is the change of each map
             at the centre of the field [mas], ``draws.motion``
             (n_resamples, 2) that of all motions in common [mas / yr].
+
+        Raises
+        ------
+        TypeError, ValueError
+            If ``n_resamples`` is not a positive integer.
         """
         n = as_integer(n_resamples, 'n_resamples', minimum=1)
         return bootstrap_frames(self._fit, n, rng)
@@ -274,6 +305,11 @@ class MotionSolution:
 
         The same table as ``stars``, in the same frames, but without what the
         catalogue says of each reference object: for comparing the two.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            With the rows and columns of ``stars``.
         """
         result = self._fit
         if result.scene.relative:

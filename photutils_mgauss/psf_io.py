@@ -31,7 +31,7 @@ _POSITION = re.compile(r'([XY])(WIN|PSF|PEAK|MODEL)?_IMAGE(_DBL)?$')
 
 @dataclass(frozen=True, eq=False)
 class PSFExModel:
-    """
+    r"""
     A PSF that PSFEx measured, as it stands in its file.
 
     Attributes
@@ -52,6 +52,29 @@ class PSFExModel:
     See Also
     --------
     read_psfex
+
+    Notes
+    -----
+    The image at the contexts :math:`c_v` is a polynomial of the T planes
+    :math:`P_t`, with the exponents :math:`n_{tv}`, zeros :math:`z_v` and
+    scales :math:`s_v`:
+
+    .. math::
+
+        I = \sum_t P_t \prod_v \left(\frac{c_v - z_v}{s_v}\right)^{n_{tv}}
+
+    Examples
+    --------
+    A model whose second plane grows along x:
+
+    >>> import numpy as np
+    >>> from photutils_mgauss import PSFExModel
+    >>> planes = np.zeros((2, 3, 3))
+    >>> planes[:, 1, 1] = 1, 0.5
+    >>> model = PSFExModel(planes, np.array([[0], [1]]), ('X_IMAGE',),
+    ...                    np.array([101.0]), np.array([200.0]), 0.5)
+    >>> model.image_at(200, 0)[1]
+    array([0.  , 1.25, 0.  ])
     """
 
     planes: np.ndarray

@@ -79,6 +79,18 @@ class Scene:
         The camera.
     wcs : `~gwcs.wcs.WCS`
         From pixels to ICRS.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import Instrument, simulate, sparse_field
+    >>> scene = simulate(sparse_field((150, 200), rng=1), rng=2,
+    ...                  instrument=Instrument(shape=(150, 200)))
+    >>> scene.image.shape == scene.error.shape == scene.mask.shape
+    True
+    >>> data = scene.image - scene.background
+    >>> stars = scene.truth[scene.truth['inside']]
+    >>> stars['x', 'y', 'flux', 'mag'].colnames
+    ['x', 'y', 'flux', 'mag']
     """
 
     image: np.ndarray

@@ -1,0 +1,41 @@
+"""
+A crowded field, taken apart
+
+A simulated field with one star of 16 to 26 mag per 16 pixels, the stars that were
+found in it, and what is left when they are subtracted, in units of the error.
+"""
+import matplotlib.pyplot as plt
+import numpy as np
+
+from photutils_mgauss import (
+    CrowdedMixturePhotometry,
+    Instrument,
+    crowded_field,
+    csst_psf,
+    simulate,
+)
+
+camera = Instrument(shape=(140, 140))
+psf = csst_psf(camera.shape)
+scene = simulate(crowded_field(camera.shape, rng=3), instrument=camera,
+                 psf=psf, rng=2)
+photometry = CrowdedMixturePhotometry(psf)
+stars = photometry(scene.image, error=scene.error, mask=scene.mask)
+residual = photometry.make_residual_image(
+    scene.image, include_local_bkg=True) / scene.error
+
+figure, axes = plt.subplots(1, 3, figsize=(12, 4), layout='constrained')
+light = np.arcsinh((scene.image - scene.background) / 10)
+for ax in axes[:2]:
+    shown = ax.imshow(light, origin='lower', cmap='gray', vmin=-1, vmax=7)
+axes[1].plot(stars['x_fit'], stars['y_fit'], '.', color='#E69F00',
+             markersize=2.5)
+figure.colorbar(shown, ax=axes[:2], shrink=0.8,
+                label='asinh(light / 10 electrons)')
+left = axes[2].imshow(residual, origin='lower', cmap='RdBu_r', vmin=-5,
+                      vmax=5)
+figure.colorbar(left, ax=axes[2], shrink=0.8, label='residual / error')
+for ax, title in zip(axes, ('image', f'{len(stars)} stars found',
+                            'residual'), strict=True):
+    ax.set(title=title, xlabel='x [pix]', ylabel='y [pix]',
+           xlim=(-0.5, 139.5), ylim=(-0.5, 139.5))

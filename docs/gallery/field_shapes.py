@@ -1,0 +1,48 @@
+"""
+A PSF made from stars, against the truth
+
+Size and ellipticity of a mixture field, fitted to the stars of one simulated
+image, minus those of the PSF the stars were drawn with.
+"""
+import matplotlib.pyplot as plt
+import numpy as np
+
+from photutils_mgauss import (
+    Instrument,
+    assess_psf,
+    csst_psf,
+    fit_mixture_field,
+    select_psf_stars,
+    simulate,
+    sparse_field,
+)
+from photutils_mgauss.plotting import plot_shape_map
+
+camera = Instrument(shape=(700, 700))
+truth = csst_psf(camera.shape)
+scene = simulate(sparse_field(camera.shape, rng=1), instrument=camera,
+                 psf=truth, rng=2)
+data = scene.image - scene.background
+stars = select_psf_stars(data, error=scene.error, mask=scene.mask)
+field = fit_mixture_field(data, stars, error=scene.error, mask=scene.mask,
+                          n_components=3, degree=2)
+
+
+fine = np.arange(-36, 37) / 3
+
+
+def true_image(x, y):
+    """Return the PSF with the pixel in it, sampled three times a pixel."""
+    return truth.mixture_at(x, y).evaluate(fine, fine[:, None],
+                                           pixel_integrated=True)
+
+
+report = assess_psf(field, true_image, (9, 9), oversampling=3)
+figure, axes = plt.subplots(1, 2, figsize=(9, 4), layout='constrained')
+for ax, name, label in (
+        (axes[0], 'size_error', r'$\delta(R^2)/R^2$'),
+        (axes[1], 'ellipticity_error', r'$\delta\epsilon$')):
+    table = report.table
+    shown = plot_shape_map(ax, table['x'], table['y'], table[name],
+                           label=label)
+    figure.colorbar(shown, ax=ax, label=label)

@@ -1,0 +1,32 @@
+"""
+The Gaussians of a PSF
+
+A PSF with Airy rings, three Gaussians fitted to it, and what they leave: the
+image summed along y (Fig. 3a of Nie et al.), its brightest row in logarithms
+(Fig. 3b), and the one-sigma ellipse of each Gaussian.
+"""
+import matplotlib.pyplot as plt
+import numpy as np
+from astropy.modeling.models import AiryDisk2D
+from scipy.ndimage import convolve1d
+
+from photutils_mgauss import fit_mixture
+from photutils_mgauss.plotting import (
+    plot_ellipses,
+    plot_profile,
+    plot_projection,
+)
+
+y, x = np.mgrid[-32:33, -32:33] / 4
+image = AiryDisk2D(radius=2.2)(0.96 * x + 0.1 * y, y)
+for axis in (0, 1):  # averaged over the pixel, four samples wide
+    image = convolve1d(image, np.array([1, 2, 2, 2, 1]) / 8, axis)
+
+fit = fit_mixture(image, 3, oversampling=4)
+figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout='constrained')
+plot_projection(axes[0], fit, image, oversampling=4)
+plot_profile(axes[1], fit, image)
+plot_ellipses(axes[2], fit.mixture)
+for ax, title in zip(axes, ('summed along y', 'the brightest row',
+                            'one-sigma ellipses'), strict=True):
+    ax.set_title(title)

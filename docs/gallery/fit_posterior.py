@@ -1,0 +1,24 @@
+"""
+The posterior of a mixture
+
+Draws of the weights and of the widths of two Gaussians, from PyMC, as in
+Appendix A of Nie et al.: histograms, and the two chains over each other.
+"""
+import matplotlib.pyplot as plt
+import numpy as np
+
+from photutils_mgauss import GaussianMixture, sample_mixture
+from photutils_mgauss.plotting import plot_posterior, plot_trace
+
+truth = GaussianMixture.from_stddevs(
+    weights=[0.7, 0.3], means=[(0, 0), (0.2, -0.1)],
+    stddevs=[(0.9, 1.0), (2.1, 1.8)], rho=[0.0, 0.3])
+noise = np.random.default_rng(1).normal(0, 2e-4, (17, 17))
+image = truth.render((17, 17), 8, 8) + noise
+
+posterior = sample_mixture(image, 2, draws=300, tune=300, chains=2,
+                           random_seed=1)
+figure, axes = plt.subplots(2, 2, figsize=(9, 5.6), layout='constrained')
+for row, name in zip(axes, ('omega', 'beta'), strict=True):
+    plot_posterior(row[0], posterior, name)
+    plot_trace(row[1], posterior, name)

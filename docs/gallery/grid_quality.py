@@ -1,0 +1,42 @@
+"""
+How good a grid is
+
+ePSFs with Airy rings, over a detector, turned into mixtures of three Gaussians: the error of the
+size at each node (as Figs. 4 to 7 of Nie et al.), the pixel-phase error, and
+the ellipticity as whiskers along the long axis.
+"""
+import matplotlib.pyplot as plt
+import numpy as np
+from astropy.modeling.models import AiryDisk2D
+from astropy.nddata import NDData
+from photutils.psf import GriddedPSFModel
+from scipy.ndimage import convolve1d
+
+from photutils_mgauss import GriddedMixturePSF
+from photutils_mgauss.plotting import plot_node_map, plot_whiskers
+
+
+def airy(x_0, y_0):
+    """Return an Airy disk that changes over the detector [0, 1000]."""
+    y, x = np.mgrid[-24:25, -24:25] / 3
+    shear = 0.1 * (x_0 - y_0) / 1000
+    image = AiryDisk2D(radius=2.6 + 0.4 * y_0 / 1000)(x + shear * y, y)
+    for axis in (0, 1):  # averaged over the pixel, three samples wide
+        image = convolve1d(image, np.full(3, 1 / 3), axis)
+    return 9 * image / image.sum()
+
+
+lines = np.linspace(0, 1000, 9)
+places = [(x, y) for y in lines for x in lines]
+epsfs = GriddedPSFModel(NDData(
+    np.array([airy(*place) for place in places]),
+    meta={'grid_xypos': places, 'oversampling': 3}))
+psf = GriddedMixturePSF.from_gridded_psf(epsfs, n_components=3)
+
+figure, axes = plt.subplots(1, 3, figsize=(13, 3.6), layout='constrained')
+plot_node_map(axes[0], psf, 'size_error')
+plot_node_map(axes[1], psf, 'phase_error')
+plot_whiskers(axes[2], psf)
+axes[2].set_title('ellipticity')
+for ax in axes:
+    ax.set_title(ax.get_title().replace(': ', '\n'), fontsize='medium')

@@ -1,0 +1,37 @@
+"""
+Errors of positions against magnitude
+
+Stars of one simulated image, measured with the true PSF: how far positions are
+from the truth, and what the fit says of it (as Figs. 9 and 10 of Nie et al.).
+"""
+import matplotlib.pyplot as plt
+import numpy as np
+
+from photutils_mgauss import (
+    Instrument,
+    MixturePSFPhotometry,
+    csst_psf,
+    simulate,
+    sparse_field,
+)
+from photutils_mgauss.plotting import plot_error_curve
+
+camera = Instrument(shape=(1500, 1500))
+psf = csst_psf(camera.shape)
+scene = simulate(sparse_field(camera.shape, rng=1, psf_fraction=0.1,
+                              magnitudes=(18, 24.5)),
+                 instrument=camera, psf=psf, rng=2)
+stars = scene.truth[scene.truth['inside']]
+start = stars['x', 'y', 'flux']
+start['flux'] = start['flux'].value
+table = MixturePSFPhotometry(psf, (11, 11), aperture_radius=3)(
+    scene.image - scene.background, error=scene.error, mask=scene.mask,
+    init_params=start)
+
+mas = 1e3 * camera.pixel_scale
+residuals = mas * np.column_stack([table[f'{c}_fit'] - stars[c].value
+                                   for c in 'xy'])
+errors = mas * np.column_stack([table[f'{c}_err'] for c in 'xy'])
+figure, ax = plt.subplots(figsize=(6, 4.2), layout='constrained')
+plot_error_curve(ax, stars['mag'].value, residuals, errors, unit='mas')
+ax.set_ylim(bottom=0.01)
