@@ -3,6 +3,7 @@ import argparse
 import json
 import os
 import sys
+import warnings
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -283,7 +284,9 @@ def write_table(table, path, record):
         table.meta = {**kept, 'MGRUN': json.dumps(record)}
     else:
         table.meta['mgauss'] = record
-    with whole_file(path) as draft:
+    with whole_file(path) as draft, warnings.catch_warnings():
+        # FITS has no electrons; astropy notes them down all the same.
+        warnings.filterwarnings('ignore', 'The unit .* could not be saved')
         table.write(draft)
 
 

@@ -119,17 +119,21 @@ def is_asdf(path):
 @contextmanager
 def open_fits(path):
     """Open a FITS file; what is wrong with it becomes one kind of error."""
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore')
-        warnings.filterwarnings('error', message='.*truncated.*')
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('always')
         try:
             hdus = fits.open(path, memmap=False, ignore_missing_end=True)
-        except (OSError, Warning) as error:
+        except OSError as error:
             if isinstance(error, (FileNotFoundError, IsADirectoryError,
                                   PermissionError)):
                 raise
             raise _damaged(path, error) from error
         with hdus:
+            len(hdus)  # reads all headers
+            # Of a truncated file astropy only warns.
+            for warning in caught:
+                if 'truncated' in str(warning.message):
+                    raise _damaged(path, warning.message)
             yield hdus
 
 
@@ -255,7 +259,7 @@ def _fits_wcs(hdus, hdu):
 def _gwcs_inside(hdus):
     """Return the gwcs of an ASDF extension, as JWST's files have it."""
     for hdu in hdus:
-        if hdu.name == 'ASDF' and not hdu.is_image:
+        if hdu.name == 'ASDF':
             tree = _asdf_tree(BytesIO(hdu.data.tobytes()))
             return find_gwcs(tree)
     return None

@@ -56,8 +56,7 @@ def _maps(psf):
 def _thinned(psf):
     """Return a grid with no more nodes than whiskers can be told apart."""
     axes = [np.unique(psf.grid_xypos[:, k]) for k in (0, 1)]
-    kept = [axis[np.unique(np.linspace(0, axis.size - 1, min(
-        axis.size, _SHOWN)).astype(int))] for axis in axes]
+    kept = [axis[::-(-axis.size // _SHOWN)] for axis in axes]
     inside = [np.isin(psf.grid_xypos[:, k], kept[k]) for k in (0, 1)]
     nodes = np.flatnonzero(inside[0] & inside[1])
     mixtures = psf.mixtures
@@ -166,7 +165,9 @@ def alignment_section(path, table, record):
                 f'{one:.3g}' for one in np.ravel(value.value))
         for name in table.colnames:
             if name.startswith(('n_', 'rms')):
-                line[name] = _number(row[name])
+                unit = getattr(row[name], 'unit', None)
+                words = name if unit is None else f'{name} [{unit}]'
+                line[words] = _number(row[name])
         rows.append(line)
     return Section(f'Alignment: {path}', rows=rows, record=record,
                    text='What the frame of each exposure was shifted by, in '
