@@ -47,7 +47,7 @@ def timed(function, *args, **kwargs):
 
 def run(program, folder, *, timeout=1200, **kwargs):
     """Run a program; its output goes to a file in the folder."""
-    with open(folder / 'log', 'a') as log:
+    with (folder / 'log').open('a') as log:
         subprocess.run(program, cwd=folder, check=True, stdout=log,
                        stderr=log, timeout=timeout, **kwargs)
 
