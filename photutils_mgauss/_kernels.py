@@ -2877,13 +2877,14 @@ def star_stamps(chosen, x, y, left, bottom, width, offset, rows, paces, count,
         w = width[i]
         for first in range(0, w, _LANES):
             height = min(_LANES, w - first)
+            walk[:] = 0.0
             tile[:3 * _LANES * w] = 0.0
             for k in range(count[i]):
                 a, mx, my, p, s, q = rows[i, k]
                 _add_gaussian(a, left[i] - x[i] - mx,
                               bottom[i] + first - y[i] - my, p, s, q,
-                              paces[i, k], 1.0, 0.0, 0.0, integrated, height,
-                              w, walk, tile)
+                              paces[i, k], 0.0, 0.0, integrated, height, w,
+                              walk, tile)
             for j in range(height):
                 to = offset[i] + (first + j) * w
                 for k in range(w):
@@ -3120,8 +3121,13 @@ def _invert_3x3(a, out):
 @_jit
 def _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node, share,
                  reach, mesh, out, mesh_out):
-    """Multiply by the joint normal matrix of stars and background."""
+    """
+    Multiply by the joint normal matrix of stars and background.
+
+    Returns the product of v and the outcome.
+    """
     mesh_out[:] = mesh @ mesh_v
+    product = 0.0
     for i in range(v.shape[0]):
         level = 0.0
         for c in range(4):
@@ -3140,23 +3146,49 @@ def _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node, share,
         for pair in range(indptr[i], indptr[i + 1]):
             b = blocks[pair]
             j = neighbour[pair]
-            v0, v1, v2 = v[j, 0], v[j, 1], v[j, 2]
-            o0 += b[0, 0] * v0 + b[0, 1] * v1 + b[0, 2] * v2
-            o1 += b[1, 0] * v0 + b[1, 1] * v1 + b[1, 2] * v2
-            o2 += b[2, 0] * v0 + b[2, 1] * v1 + b[2, 2] * v2
+            w0, w1, w2 = v[j, 0], v[j, 1], v[j, 2]
+            o0 += b[0, 0] * w0 + b[0, 1] * w1 + b[0, 2] * w2
+            o1 += b[1, 0] * w0 + b[1, 1] * w1 + b[1, 2] * w2
+            o2 += b[2, 0] * w0 + b[2, 1] * w1 + b[2, 2] * w2
         out[i, 0] = o0
         out[i, 1] = o1
         out[i, 2] = o2
+        product += v0 * o0 + v1 * o1 + v2 * o2
+    for m in range(mesh_v.size):
+        product += mesh_v[m] * mesh_out[m]
+    return product
 
 
 @_jit
 def _precondition(inverse, mesh, r, mesh_r, z, mesh_z):
+    """Put r times the inverse blocks into z; return the product of both."""
+    product = 0.0
     for i in range(r.shape[0]):
-        for m in range(3):
-            z[i, m] = (inverse[i, m, 0] * r[i, 0] + inverse[i, m, 1] * r[i, 1]
-                       + inverse[i, m, 2] * r[i, 2])
+        c = inverse[i]
+        r0, r1, r2 = r[i, 0], r[i, 1], r[i, 2]
+        z0 = c[0, 0] * r0 + c[0, 1] * r1 + c[0, 2] * r2
+        z1 = c[1, 0] * r0 + c[1, 1] * r1 + c[1, 2] * r2
+        z2 = c[2, 0] * r0 + c[2, 1] * r1 + c[2, 2] * r2
+        z[i, 0], z[i, 1], z[i, 2] = z0, z1, z2
+        product += r0 * z0 + r1 * z1 + r2 * z2
     for m in range(mesh_r.size):
         mesh_z[m] = mesh_r[m] / mesh[m, m]
+        product += mesh_r[m] * mesh_z[m]
+    return product
+
+
+@_jit
+def _add_scaled(x, scale, y):
+    """Add scale * y to x, both flat."""
+    for i in range(x.size):
+        x[i] += scale * y[i]
+
+
+@_jit
+def _extend(x, scale, y):
+    """Put y + scale * x into x, both flat."""
+    for i in range(x.size):
+        x[i] = y[i] + scale * x[i]
 
 
 @_jit
@@ -3169,7 +3201,8 @@ def solve_joint(matrix, gradient, indptr, neighbour, blocks, node, share,
     Stars couple to their neighbours (`pair_blocks`) and to the four nodes
     node (n, 4) of the background around them, with the bilinear shares
     share (n, 4); mesh (m, m) is the background's own matrix. Each star's own
-    block is the preconditioner. Returns the number of steps.
+    block is the preconditioner; stars whose block is singular do not move.
+    Returns the number of steps.
     """
     n = gradient.shape[0]
     inverse = np.empty((n, 3, 3))
@@ -3177,38 +3210,26 @@ def solve_joint(matrix, gradient, indptr, neighbour, blocks, node, share,
         _invert_3x3(matrix[i], inverse[i])
     step[:] = 0
     mesh_step[:] = 0
-    r = gradient.copy()
-    for i in range(n):
-        if inverse[i, 0, 0] == 0:
-            r[i] = 0
-    mesh_r = mesh_gradient.copy()
-    z = np.empty_like(r)
-    mesh_z = np.empty_like(mesh_r)
-    _precondition(inverse, mesh, r, mesh_r, z, mesh_z)
-    v = z.copy()
-    mesh_v = mesh_z.copy()
-    a = np.empty_like(r)
-    mesh_a = np.empty_like(mesh_r)
-    rz = (r * z).sum() + (mesh_r * mesh_z).sum()
+    r, mesh_r = gradient.copy(), mesh_gradient.copy()
+    z, mesh_z = np.empty_like(r), np.empty_like(mesh_r)
+    # A preconditioner of zero keeps singular stars out of z, and so of v.
+    rz = _precondition(inverse, mesh, r, mesh_r, z, mesh_z)
+    v, mesh_v = z.copy(), mesh_z.copy()
+    a, mesh_a = np.empty_like(r), np.empty_like(mesh_r)
     goal = tolerance * tolerance * rz
     for count in range(max_steps):
         if not rz > goal:
             return count
-        _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node,
-                     share, reach, mesh, a, mesh_a)
-        alpha = rz / ((v * a).sum() + (mesh_v * mesh_a).sum())
-        step += alpha * v
-        mesh_step += alpha * mesh_v
-        r -= alpha * a
-        mesh_r -= alpha * mesh_a
-        for i in range(n):
-            if inverse[i, 0, 0] == 0:
-                r[i] = 0
-        _precondition(inverse, mesh, r, mesh_r, z, mesh_z)
+        alpha = rz / _apply_joint(v, mesh_v, matrix, indptr, neighbour,
+                                  blocks, node, share, reach, mesh, a, mesh_a)
+        _add_scaled(step.reshape(-1), alpha, v.reshape(-1))
+        _add_scaled(mesh_step, alpha, mesh_v)
+        _add_scaled(r.reshape(-1), -alpha, a.reshape(-1))
+        _add_scaled(mesh_r, -alpha, mesh_a)
         before = rz
-        rz = (r * z).sum() + (mesh_r * mesh_z).sum()
-        v = z + rz / before * v
-        mesh_v = mesh_z + rz / before * mesh_v
+        rz = _precondition(inverse, mesh, r, mesh_r, z, mesh_z)
+        _extend(v.reshape(-1), rz / before, z.reshape(-1))
+        _extend(mesh_v, rz / before, mesh_z)
     return max_steps
 
 
