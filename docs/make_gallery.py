@@ -1,9 +1,9 @@
 """
 The gallery: a page and a thumbnail for every script in ``docs/gallery``.
 
-A script begins with a docstring, whose first line is the title, and leaves its
-figure in the variable ``figure``. It runs when the pages are built, and again
-only when it has changed.
+A script begins with a docstring, whose first line, without its full stop, is
+the title, and leaves its figure in the variable ``figure``. It runs when the
+pages are built, and again only when it has changed.
 """
 import ast
 import runpy
@@ -70,7 +70,7 @@ def _page(script, folder):
         _draw(script, picture)
     code = script.read_text(encoding='utf-8')
     tree = ast.parse(code)
-    title, _, text = ast.get_docstring(tree).partition('\n')
+    title, _, text = ast.get_docstring(tree).partition('.\n')
     _write(folder / f'{script.stem}.rst', PAGE.format(
         title=title, line='=' * len(title), name=script.stem,
         text=text.strip(), script=f'../../gallery/{script.name}',

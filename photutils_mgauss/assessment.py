@@ -21,6 +21,9 @@ from photutils_mgauss.shapes import adaptive_moments
 
 __all__ = ['PSFAssessment', 'assess_psf']
 
+# Images of pixel-integrated PSFs: samples per pixel, half the width [pix].
+_FINE, _REACH = 4, 8
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PSFAssessment:
@@ -104,7 +107,8 @@ def assess_psf(model, truth, grid=(30, 30), *, shape=None, oversampling=1,
     model, truth : MixtureField, GriddedMixturePSF or callable
         Anything with a method ``mixture_at(x, y)``, or a function of x and y
         that returns a mixture or an image of the PSF, sampled ``oversampling``
-        times a pixel with the star in its middle.
+        times a pixel with the star in its middle. All contain the pixel: a
+        grid that is ``pixel_integrated`` is integrated.
     grid : (int, int), optional
         The number of places along y and x, from the first pixel to the last.
     shape : (int, int), optional
@@ -140,7 +144,7 @@ def assess_psf(model, truth, grid=(30, 30), *, shape=None, oversampling=1,
     x, y = _places(rows, columns, _detector(model, truth, shape), mid_cell)
     if mid_cell:
         rows, columns = rows - 1, columns - 1
-    real, mine = (_moments(_profiles(psf, name), x, y, oversampling)
+    real, mine = (_moments(*_profiles(psf, name, oversampling), x, y)
                   for psf, name in ((truth, 'truth'), (model, 'model')))
     table = QTable({'x': x, 'y': y, 'r2': real.r2,
                     'size_error': real.relative_size_error(mine),
@@ -170,17 +174,29 @@ def _detector(model, truth, shape):
     raise ValueError(msg)
 
 
-def _profiles(psf, name):
-    """Return the function from a position to a mixture or an image."""
+def _profiles(psf, name, oversampling):
+    """Return what makes a mixture or image of a position, its sampling."""
     profile = getattr(psf, 'mixture_at', psf)
     if not callable(profile):
         msg = (f'{name} must have a method mixture_at or be callable, got '
                f'{psf!r:.80}')
         raise TypeError(msg)
-    return profile
+    if getattr(psf, 'pixel_integrated', False):
+        return _pixel_images(profile), _FINE
+    return profile, oversampling
 
 
-def _moments(profile, x, y, oversampling):
+def _pixel_images(profile):
+    """Return what makes an image, with the pixel in it, of a position."""
+    steps = np.arange(-_REACH * _FINE, _REACH * _FINE + 1) / _FINE
+
+    def image(x, y):
+        return profile(x, y).evaluate(steps, steps[:, None],
+                                      pixel_integrated=True)
+    return image
+
+
+def _moments(profile, oversampling, x, y):
     found = [profile(*place) for place in zip(x, y, strict=True)]
     if all(isinstance(one, GaussianMixture) for one in found):
         return adaptive_moments(found)

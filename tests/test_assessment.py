@@ -59,3 +59,15 @@ def test_errors_name_the_argument():
         assess_psf(varying, 3, shape=(9, 9))
     with pytest.raises(ValueError, match='shape must be given'):
         assess_psf(varying, varying)
+
+
+def test_a_grid_that_lacks_the_pixel_gets_it():
+    mixture = GaussianMixture([1], [[0, 0]], [[[4, 0.3], [0.3, 3]]])
+    pixel = mixture.convolve(np.eye(2) / 12)
+    corners = [(0, 0), (50, 0), (0, 50), (50, 50)]
+    optics = GriddedMixturePSF([mixture] * 4, corners, pixel_integrated=True)
+    sampled = GriddedMixturePSF([pixel] * 4, corners)
+    report = assess_psf(sampled, optics, (2, 2))
+    assert_allclose(report.table['size_error'], 0, atol=3e-4)
+    bare = GriddedMixturePSF([mixture] * 4, corners)
+    assert report.median('r2') > assess_psf(bare, bare, (2, 2)).median('r2')

@@ -1,5 +1,5 @@
 """
-The Gaussians of a PSF
+The Gaussians of a PSF.
 
 A PSF with Airy rings, three Gaussians fitted to it, and what they leave: the
 image summed along y (Fig. 3a of Nie et al.), its brightest row in logarithms

@@ -1,5 +1,5 @@
 """
-How many Gaussians
+How many Gaussians.
 
 The residuals of fits with one to five Gaussians, on one scale, as in Appendix
 B of Nie et al., with the time of each fit. What it means for positions is the

@@ -1,5 +1,5 @@
 """
-The posterior of a mixture
+The posterior of a mixture.
 
 Draws of the weights and of the widths of two Gaussians, from PyMC, as in
 Appendix A of Nie et al.: histograms, and the two chains over each other.

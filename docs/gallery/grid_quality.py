@@ -1,9 +1,9 @@
 """
-How good a grid is
+How good a grid is.
 
-ePSFs with Airy rings, over a detector, turned into mixtures of three Gaussians: the error of the
-size at each node (as Figs. 4 to 7 of Nie et al.), the pixel-phase error, and
-the ellipticity as whiskers along the long axis.
+ePSFs with Airy rings, over a detector, turned into mixtures of three
+Gaussians: the error of the size at each node (as Figs. 4 to 7 of Nie et al.),
+the pixel-phase error, and the ellipticity as whiskers along the long axis.
 """
 import matplotlib.pyplot as plt
 import numpy as np

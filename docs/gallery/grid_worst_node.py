@@ -1,9 +1,9 @@
 """
-The worst node of a grid
+The worst node of a grid.
 
-Where a mixture describes its ePSF worst, and what is left there, for two, three and
-five Gaussians. A pattern that one component could take up asks for more of
-them.
+Where a mixture describes its ePSF worst, and what is left there, for two,
+three and five Gaussians. A pattern that one component could take up asks for
+more of them.
 """
 import matplotlib.pyplot as plt
 import numpy as np

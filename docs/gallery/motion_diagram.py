@@ -1,8 +1,8 @@
 """
-Proper motions
+Proper motions.
 
-Stars and quasars of a simulated field at five epochs of Nie et al.: the diagram of
-their motions, and the measured motions beside the true ones.
+Stars and quasars of a simulated field at five epochs of Nie et al.: the
+diagram of their motions, and the measured motions beside the true ones.
 """
 import matplotlib.pyplot as plt
 import numpy as np

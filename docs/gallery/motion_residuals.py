@@ -1,9 +1,9 @@
 """
-What an alignment leaves
+What an alignment leaves.
 
-The residuals of one of three epochs whose frames differ by rotation, scale and
-distortion, aligned with shifts alone and with polynomials of degree 3. An arrow in
-a pattern is distortion, arrows at random are noise.
+The residuals of one of three epochs whose frames differ by rotation, scale
+and distortion, aligned with shifts alone and with polynomials of degree 3. An
+arrow in a pattern is distortion, arrows at random are noise.
 """
 import matplotlib.pyplot as plt
 

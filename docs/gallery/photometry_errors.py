@@ -1,8 +1,9 @@
 """
-Errors of positions against magnitude
+Errors of positions against magnitude.
 
-Stars of one simulated image, measured with the true PSF: how far positions are
-from the truth, and what the fit says of it (as Figs. 9 and 10 of Nie et al.).
+Stars of one simulated image, measured with the true PSF: how far positions
+are from the truth, and what the fit says of it (as Figs. 9 and 10 of Nie et
+al.).
 """
 import matplotlib.pyplot as plt
 import numpy as np

@@ -1,9 +1,9 @@
 """
-Pixel-phase errors
+Pixel-phase errors.
 
 The same bright stars at all positions within a pixel, measured with the true
-PSF and with a single Gaussian. Where the PSF is wrong, the position depends on
-where in its pixel a star lies.
+PSF and with a single Gaussian. Where the PSF is wrong, the position depends
+on where in its pixel a star lies.
 """
 import matplotlib.pyplot as plt
 import numpy as np
