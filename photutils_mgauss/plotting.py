@@ -371,8 +371,8 @@ def plot_residual(ax, fit, *, peak, limit=None, label=None):
     """
     Show the residual image of a fit, as a fraction of the image's peak.
 
-    One panel of the figure in Appendix B; `compare_n_components` gives the
-    fits and their times.
+    One panel of the figure in Appendix B;
+    `~photutils_mgauss.compare_n_components` gives the fits and their times.
 
     Parameters
     ----------
@@ -413,7 +413,7 @@ def plot_comparison_of_numbers(axes, image, table):
     image : (ny, nx) array_like
         The image.
     table : `~astropy.table.QTable`
-        From `compare_n_components`.
+        From `~photutils_mgauss.compare_n_components`.
 
     Returns
     -------
@@ -581,7 +581,8 @@ def plot_shape_map(ax, x, y, values, *, label):
     Show a quantity at points of the detector, its mean and scatter on top.
 
     As Figs. 4 to 7, for the deviations that
-    `Shapes.relative_size_error` and `Shapes.ellipticity_error` return.
+    `~photutils_mgauss.Shapes.relative_size_error` and
+    `~photutils_mgauss.Shapes.ellipticity_error` return.
 
     Parameters
     ----------
