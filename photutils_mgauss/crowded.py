@@ -54,6 +54,29 @@ class UnfinishedTilesError(RuntimeError):
         The parts of the image, in pixels, without a result.
     table : `~astropy.table.QTable`
         The stars of the tiles that were finished.
+
+    Examples
+    --------
+    Take what there is, and solve the rest again:
+
+    >>> import numpy as np
+    >>> from concurrent.futures import ThreadPoolExecutor
+    >>> from photutils_mgauss import (CrowdedMixturePhotometry,
+    ...                               GaussianMixture, GriddedMixturePSF,
+    ...                               UnfinishedTilesError)
+    >>> mixture = GaussianMixture([1], [[0, 0]], [[[0.7, 0], [0, 0.8]]])
+    >>> psf = GriddedMixturePSF([mixture], [(0, 0)])
+    >>> pool = ThreadPoolExecutor()
+    >>> pool.shutdown()  # all of its workers are gone
+    >>> phot = CrowdedMixturePhotometry(psf, executor=pool)
+    >>> try:
+    ...     table = phot(np.ones((40, 50)), error=np.ones((40, 50)))
+    ... except UnfinishedTilesError as error:
+    ...     table, left = error.table, error.unfinished
+    >>> left
+    [(0, 40, 0, 50)]
+    >>> len(table)
+    0
     """
 
     def __init__(self, unfinished, table):
