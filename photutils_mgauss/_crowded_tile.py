@@ -60,7 +60,7 @@ _SEPARATION = 0.3
 _GRAVE = 0.5
 # Finding starts with the brightest stars.
 _FALLING = (80, 25, 10)
-_FINAL_STEPS = 8
+_FINAL_STEPS = 6
 # Polishing moves no star further than this [pix]: blends that cannot be
 # resolved would run away.
 _ROAM = 0.5
@@ -561,12 +561,12 @@ def _find_all(tile):
     for number in range(options.max_rounds):
         tile.find(options.threshold, len(_FALLING) + number)
         tile.step(0.05)
-        tile.step(0.05)
-        if number > 1:
+        if number < 2:
+            tile.leave_out(0.7 * options.keep)
+        else:
+            tile.step(0.05)
             gone = tile.leave_out(options.keep)
             tile.graves = np.concatenate([tile.graves, gone])
-        else:
-            tile.leave_out(0.7 * options.keep)
 
 
 def _settle(tile):
