@@ -3165,7 +3165,10 @@ def _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node, share,
 
     Returns the product of v and the outcome.
     """
-    mesh_out[:] = mesh @ mesh_v
+    for m in range(mesh_v.size):
+        mesh_out[m] = 0.0
+        for n in range(mesh_v.size):
+            mesh_out[m] += mesh[m, n] * mesh_v[n]
     product = 0.0
     for i in range(v.shape[0]):
         level = 0.0
