@@ -19,15 +19,16 @@ import map_figures
 import psf_figures
 import sky_figures
 import summary
+import table_figures
 from peers import INSTALL
 from settings import FULL, QUICK, optics
 from store import Run
 
-GROUPS = (*psf_figures.GROUPS, *map_figures.GROUPS, *sky_figures.GROUPS,
-          *crowded_figures.GROUPS)
-ORDER = ('fig1', 'fig2', 'fig3', 'fig4', 'fig5', 'fig6', 'fig7', 'fig8',
-         'fig9', 'fig10', 'fig11', 'fig12', 'fig13', 'fig14', 'appendix_a',
-         'appendix_b')
+GROUPS = (*table_figures.GROUPS, *psf_figures.GROUPS, *map_figures.GROUPS,
+          *sky_figures.GROUPS, *crowded_figures.GROUPS)
+ORDER = ('table1', 'table2', 'fig1', 'fig2', 'fig3', 'fig4', 'fig5', 'fig6',
+         'fig7', 'fig8', 'fig9', 'fig10', 'fig11', 'fig12', 'fig13', 'fig14',
+         'appendix_a', 'appendix_b')
 
 
 def arguments(argv=None):
@@ -80,7 +81,8 @@ def main(argv=None):
                   command(options))
     for name, why in run.skipped.items():
         print(f'left out: {name}: {why}')
-    print(f'{len(done)} figures and summary.rst are in {run.folder}')
+    print(f'{len(done)} figures and tables and summary.rst are in '
+          f'{run.folder}')
     return 0
 
 
@@ -93,7 +95,8 @@ def make(run, group, chosen):
         warnings.simplefilter('ignore')
         tables = group.measure(run)
         for figure in chosen:
-            run.figure(figure.key, figure.draw(tables))
+            if figure.draw is not None:
+                run.figure(figure.key, figure.draw(tables))
             done[figure.key] = figure, figure.compare(tables)
     print(f'{", ".join(done)}: {time.perf_counter() - start:.0f} s',
           flush=True)

@@ -133,7 +133,7 @@ class Figure:
         Its name on the command line.
     title, text : str
         What it is, and what is done here.
-    draw : callable
+    draw : callable or None
         From the tables of the group to a matplotlib figure.
     compare : callable
         From the tables to a list of `Comparison`.

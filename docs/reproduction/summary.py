@@ -14,10 +14,13 @@ Made on {date} with ``{command}``, with
 
 {versions}
 
-The true PSF of the images is {optics}. Detectors are smaller than in the
-paper: {sizes} What a figure shows is stored in the tables below it, with
-date, versions and settings in their headers. *Reached* means that our number
-is not larger than the printed one.
+{sizes}
+
+What a figure shows is stored in the tables below it, with date, versions and
+settings in their headers. *Reached* means that our number is not larger than
+the printed one. Simulations have one seed each: numbers of another seed
+differ by their statistical errors, which for a bin of n stars are about
+1.2 / sqrt(n) of a scatter.
 
 {skipped}
 """
@@ -45,7 +48,9 @@ def _head(run, command):
                          if name not in ('date', 'machine'))
     s = run.settings
     sizes = (
-        f'{s.size} pixels on a side in Figs. 1 to 7, with {s.grid} x '
+        f'The true PSF of the images is {_OPTICS[run.optics]}. Detectors '
+        f'are smaller than in the paper: {s.size} pixels on a side in '
+        f'Figs. 1 to 7, with {s.grid} x '
         f'{s.grid} places on each of {len(s.detectors)} detectors in place '
         f'of 30 x 30 on 18; {s.sky_size} in Figs. 8 to 12, with '
         f'{s.sources[0]} stars and {s.sources[1]} quasars, of which '
@@ -55,8 +60,7 @@ def _head(run, command):
         "paper's of those of 135.")
     return _HEAD.format(
         date=found['date'], command=command, versions=_filled(versions),
-        optics=_OPTICS[run.optics], sizes=_filled(sizes).strip(),
-        skipped=_skipped(run))
+        sizes=_filled(sizes), skipped=_skipped(run))
 
 
 def _filled(text, width=78):
@@ -76,9 +80,10 @@ def _section(run, figure, lines, command):
     base, _, _ = command.partition(' --figures')
     own = f'{base} --figures {figure.key}'
     rows = [figure.title, '-' * len(figure.title), '', _filled(figure.text),
-            '', f'Made by ``{own}``.', '',
-            f'.. image:: figures/{figure.key}.png',
-            f'   :alt: {figure.title}', '']
+            '', f'Made by ``{own}``.', '']
+    if figure.draw is not None:
+        rows += [f'.. image:: figures/{figure.key}.png',
+                 f'   :alt: {figure.title}', '']
     if lines:
         rows += _table(lines)
     tables = sorted(path.name for path in (run.folder / 'tables').glob(
