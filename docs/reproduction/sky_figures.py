@@ -270,7 +270,9 @@ def draw_epochs(tables):
             tables['catalogues'], exposures(), strict=True)):
         x, y = np.asarray(table['x']), np.asarray(table['y'])
         sky = taken.wcs(_shape_of(table), PIXEL)(x, y)
-        left.plot(*sky, MARKS[number], color=COLOURS[number], markersize=2,
+        # Rings in each other: the exposures show the same sources.
+        left.plot(*sky, 'o', mfc='none', color=COLOURS[number],
+                  markersize=1 + 0.8 * number, markeredgewidth=0.5,
                   label=f'{taken.time.utc.isot[:10]}, {taken.band.name}')
     left.set(xlabel='right ascension [deg]', ylabel='declination [deg]')
     left.invert_xaxis()
@@ -352,11 +354,12 @@ def draw_medians(tables):
                     label=f'{label}, scatter about the truth')
         ax.plot([5, 7], [1.0, 0.8], '*', color=COLOURS[0], markersize=11,
                 label='printed: 1.0 and 0.8')
-        ax.set(xlabel='number of observations', ylim=(0, None),
+        ax.set(xlabel='number of observations',
                ylabel='error of a motion [mas / yr]',
                title={'joint': 'joint solution',
                       'paper': 'recipe of the paper'}[recipe])
         ax.legend(fontsize=7)
+    ax.set_ylim(0, 1.1 * max(1, *table['scatter'].value))
     return canvas
 
 
@@ -395,7 +398,8 @@ def draw_bins(tables):
             part = table[(table['count'] == count)
                          & (table['motion'] == name)]
             _draw_bin(axes[:, column], part, k, count)
-        axes[0, column].set(yscale='log', title=label,
+        axes[0, column].set(yscale='log' if len(table) else 'linear',
+                            title=label,
                             ylabel='total error [mas / yr]')
         axes[1, column].axhline(0, color='0.5', linewidth=0.8)
         axes[1, column].set(xlabel='g [mag]',
