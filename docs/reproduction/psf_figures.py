@@ -226,12 +226,18 @@ GROUPS = (
                'them. The stamp has 31 samples a side, where the paper has '
                '30, so that the star is in the middle of one.', draw_graph),
         Figure('fig3', 'Fig. 3: profile and components',
-               'Three Gaussians fitted to that stamp by ``fit_mixture``.',
+               'Three Gaussians fitted to that stamp by ``fit_mixture``. '
+               'Shares depend on the aberrations: where coma is strong, as '
+               'in the middle of this detector, the core takes more than one '
+               'Gaussian.',
                draw_components, compare_components),
         Figure('appendix_b', 'Appendix B: the number of Gaussians',
                'Residuals for one, three and five Gaussians, by '
                '``compare_n_components``; time is that of one least-squares '
-               'fit.', draw_numbers, compare_numbers))),
+               'fit. One Gaussian has the size and ellipticity of the image '
+               'by construction, because adaptive moments are those of the '
+               'Gaussian that matches it best: what it lacks shows in the '
+               'residual only.', draw_numbers, compare_numbers))),
     Group('posterior', measure_posterior, (
         Figure('appendix_a', 'Appendix A: the posterior',
                'Draws of ``sample_mixture`` with the priors of the paper: '
