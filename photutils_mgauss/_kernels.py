@@ -1821,8 +1821,13 @@ _STEP_TOLERANCE = 1e-6
 # flat array: for each pixel column _LANES values of the PSF, as many of its
 # derivative by x_0, and as many by y_0. Neighbouring rows are neighbours in
 # memory and fixed offsets lie between the parts, so that the compiler works on
-# several rows at once.
-_LANES = 32
+# several rows at once; their number is a constant, for a remainder of a few
+# rows one by one would take longer than all the others.
+_LANES = 16
+
+# The smallest share of a Gaussian in a blend, so that the slope of the share
+# can be divided by it; lost in rounding where it stands for zero.
+_LEAST_SHARE = 1e-30
 
 
 @_jit
@@ -1844,12 +1849,13 @@ def paces(nodes, out):
 
 
 @_jit
-def _walk_starts(a, dx, dy, p, s, q, pace, w, wy, height, walk):
+def _walk_starts(a, dx, dy, p, s, q, pace, by_x, by_y, height, walk):
     """
     Put what a walk along the columns starts from into walk (4, _LANES) flat.
 
     For each row the Gaussian in the first column, its quotient with the next
-    one, p u, and the factor of the Gaussian in its derivative by y. Returns
+    one, and the factors of the Gaussian in its derivative by x and, short of
+    s times the former, by y. Rows from height on stay as they are. Returns
     whether anything is there. The values of the first column are a Gaussian
     in y, walked outward from its peak. pace is as of `paces`.
     """
@@ -1878,41 +1884,32 @@ def _walk_starts(a, dx, dy, p, s, q, pace, w, wy, height, walk):
     for j in range(height):
         walk[_LANES + j] = r
         r *= grow
+    by_y += s * by_x
     for j in range(height):
-        walk[2 * _LANES + j] = p * (dx - s * j)
-        walk[3 * _LANES + j] = w * q * (dy + j) + wy
+        walk[2 * _LANES + j] = p * (dx - s * j) + by_x
+        walk[3 * _LANES + j] = q * (dy + j) + by_y
     return True
 
 
 @_jit
-def _add_walk(p, s, fall, w, wx, height, width, walk, tile):
+def _add_walk(p, s, fall, width, walk, tile):
     """Add a Gaussian to a tile, two multiplications a pixel."""
     for i in range(width):
         column = 3 * _LANES * i
         pi = p * i
-        for j in range(height):
+        for j in range(_LANES):
             g = walk[j]
             r = walk[_LANES + j]
             h = (walk[2 * _LANES + j] + pi) * g
-            tile[column + j] += w * g
-            tile[column + _LANES + j] += w * h + wx * g
-            tile[column + 2 * _LANES + j] += (
-                walk[3 * _LANES + j] * g - w * s * h)
+            tile[column + j] += g
+            tile[column + _LANES + j] += h
+            tile[column + 2 * _LANES + j] += walk[3 * _LANES + j] * g - s * h
             walk[j] = g * r
             walk[_LANES + j] = r * fall
 
 
 @_jit
-def _add_pixel(g, by_x, by_y, w, wx, wy, i, j, tile):
-    """Add a Gaussian and its derivatives in one pixel, weighted."""
-    k = 3 * _LANES * i + j
-    tile[k] += w * g
-    tile[k + _LANES] += w * by_x + wx * g
-    tile[k + 2 * _LANES] += w * by_y + wy * g
-
-
-@_jit
-def _add_points(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
+def _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height, width,
                 tile):
     """Add a Gaussian to a tile, each pixel for itself."""
     for i in range(width):
@@ -1920,26 +1917,51 @@ def _add_points(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
             u, v = dx + i, dy + j
             g = a * _value(u, v, p, s, q, integrated)
             gx, gy = _gradient(u, v, p, s, q, integrated)
-            _add_pixel(g, -a * gx, -a * gy, w, wx, wy, i, j, tile)
+            k = 3 * _LANES * i + j
+            tile[k] += g
+            tile[k + _LANES] += by_x * g - a * gx
+            tile[k + 2 * _LANES] += by_y * g - a * gy
 
 
 @_jit
-def _add_gaussian(a, dx, dy, p, s, q, pace, w, wx, wy, integrated, height,
+def _add_gaussian(a, dx, dy, p, s, q, pace, by_x, by_y, integrated, height,
                   width, walk, tile):
     """
     Add a Gaussian, its first pixel at (dx, dy) from the peak, to a tile.
 
-    w is its share in the blend, wx and wy the slopes of the share.
+    a includes its share in the blend, whose relative slopes are by_x and
+    by_y.
     """
     left = min(dx - s * dy, dx - s * (dy + height - 1))
     # A walk that begins too far out begins at zero.
     steep = (p > 50 or q > 50 or p * abs(s) * height > 200
              or (left < 0 and p * left * left > 600))
     if integrated or steep:
-        _add_points(a, dx, dy, p, s, q, w, wx, wy, integrated, height, width,
-                    tile)
-    elif _walk_starts(a, dx - s * dy, dy, p, s, q, pace, w, wy, height, walk):
-        _add_walk(p, s, pace[3], w, wx, height, width, walk, tile)
+        _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height,
+                    width, tile)
+    elif _walk_starts(a, dx - s * dy, dy, p, s, q, pace, by_x, by_y, height,
+                      walk):
+        _add_walk(p, s, pace[3], width, walk, tile)
+
+
+@_jit
+def _fill_tile(x_0, y_0, row, column, height, width, psf, tiling):
+    """Put the PSF and its derivatives in up to _LANES rows into the tile."""
+    nodes, paces, _, _, integrated = psf
+    walk, tile, index, weights = tiling
+    walk[:] = 0.0
+    tile[:3 * _LANES * width] = 0.0
+    for corner in range(4):
+        w, wx, wy = weights[0, corner], weights[1, corner], weights[2, corner]
+        if w == 0 and wx == 0 and wy == 0:
+            continue
+        w = max(w, _LEAST_SHARE)
+        for k in range(nodes.shape[1]):
+            a, mx, my, p, s, q = nodes[index[corner], k]
+            if a != 0:
+                _add_gaussian(w * a, column - x_0 - mx, row - y_0 - my, p, s,
+                              q, paces[index[corner], k], wx / w, wy / w,
+                              integrated, height, width, walk, tile)
 
 
 @_jit
@@ -1951,25 +1973,12 @@ def _fill_jet(x_0, y_0, box, psf, tiling, jet):
     paces, x_grid, y_grid, integrated), tiling is scratch (walk, tile, index,
     weights). The change of the blend with position is included.
     """
-    nodes, paces, x_grid, y_grid, integrated = psf
-    walk, tile, index, weights = tiling
-    blend_weights(x_0, y_0, x_grid, y_grid, index, weights)
+    _, tile, index, weights = tiling
+    blend_weights(x_0, y_0, psf[2], psf[3], index, weights)
     row, column, height, width = box
     for bottom in range(0, height, _LANES):
         rows = min(_LANES, height - bottom)
-        tile[:3 * _LANES * width] = 0.0
-        for corner in range(4):
-            w, wx, wy = (weights[0, corner], weights[1, corner],
-                         weights[2, corner])
-            if w == 0 and wx == 0 and wy == 0:
-                continue
-            for k in range(nodes.shape[1]):
-                a, mx, my, p, s, q = nodes[index[corner], k]
-                if a != 0:
-                    _add_gaussian(a, column - x_0 - mx,
-                                  row + bottom - y_0 - my, p, s, q,
-                                  paces[index[corner], k], w, wx, wy,
-                                  integrated, rows, width, walk, tile)
+        _fill_tile(x_0, y_0, row + bottom, column, rows, width, psf, tiling)
         for part in range(3):
             for i in range(width):
                 k = (3 * i + part) * _LANES

@@ -12,6 +12,7 @@ Photutils fits groups of stars without derivatives; here each star of a group
 contributes those of its own PSF.
 """
 import numpy as np
+from scipy.linalg import cho_solve, cholesky
 
 from photutils_mgauss import _compat
 from photutils_mgauss._psf_model import PSFModel
@@ -24,8 +25,15 @@ _MESSAGES = {
     3: 'The next step is expected to be below the tolerance.',
 }
 
-# Of the expected next step, see _length.
+# Of the expected next step, see _State.length.
 _TOLERANCE = 1e-6
+
+# Matrices scaled to a diagonal of one whose Cholesky factor has a smaller
+# square than this on its diagonal are taken for singular.
+_SINGULAR = 1e-14
+
+# Added to norms that may be zero.
+_SMALLEST = np.finfo(float).tiny
 
 # The step of numerical derivatives, for models without analytic ones.
 _EPSILON = np.sqrt(np.finfo(float).eps)
@@ -112,20 +120,38 @@ class MixtureFitter:
 
 
 class _State:
-    """Parameter values and what a step from them needs."""
+    """
+    Parameter values and what a step from them needs.
 
-    def __init__(self, values, residuals, jacobian):
+    norms (n,) are those of the weighted image of each parameter's own star,
+    sigma is the scatter that weighted residuals are expected to have.
+    """
+
+    def __init__(self, values, residuals, jacobian, norms, sigma):
         self.values = values
         self.residuals = residuals
         self.chi2 = residuals @ residuals
         self.matrix = jacobian @ jacobian.T
         self.gradient = -(jacobian @ residuals)
+        self.norms = norms
+        self.sigma = sigma
 
     @property
     def scale(self):
         """The square roots of the matrix's diagonal, 1 where it is zero."""
         scale = np.sqrt(np.diag(self.matrix))
         return np.where(scale > 0, scale, 1)
+
+    def length(self, step):
+        """
+        Return the largest step, in a measure without units.
+
+        It is the change that a step makes to the image of its star, over the
+        image itself or, for faint stars, over a tenth of the noise.
+        """
+        change = np.abs(step) * self.scale
+        return np.max(change / (self.norms + 0.1 * self.sigma + _SMALLEST),
+                      initial=0)
 
 
 class _Problem:
@@ -178,29 +204,60 @@ class _Problem:
         parameters = self.full(values).reshape(self.n_sources, -1)
         free = self.free.reshape(self.n_sources, -1)
         total = np.zeros(self.z.size)
-        rows = []
+        rows, norms = [], []
         for own, is_free in zip(parameters, free, strict=True):
             value, derivatives = _derivatives(self.base, self.x, self.y, own,
                                               is_free)
             total += value
             rows += derivatives
+            if self.weights is not None:
+                value = value * self.weights
+            norms += [np.linalg.norm(value)] * len(derivatives)
         residuals, jacobian = total - self.z, np.array(rows)
         if self.weights is not None:
             residuals *= self.weights
             jacobian *= self.weights
-        return _State(values, residuals, jacobian)
+        return _State(values, residuals, jacobian, np.array(norms),
+                      self._expected_scatter(residuals))
+
+    def _expected_scatter(self, residuals):
+        if self.weights is not None:
+            return 1.0
+        dof = max(self.z.size - np.count_nonzero(self.free), 1)
+        return np.linalg.norm(residuals) / np.sqrt(dof)
 
     def covariance(self, state):
         """Return the covariance of the free parameters, or None."""
         dof = self.z.size - state.values.size
         if dof <= 0 or not np.isfinite(state.matrix).all():
             return None
-        scale = state.scale
-        scaled = state.matrix / np.outer(scale, scale)
-        inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
-        covariance = inverse / np.outer(scale, scale)
+        covariance = _inverse(state.matrix, state.scale)
         return covariance * (1 if self.weights is not None
                              else state.chi2 / dof)
+
+
+def _inverse(matrix, scale):
+    """Return the inverse, or the pseudo-inverse of a singular matrix."""
+    outer = np.outer(scale, scale)
+    factor = _factor(matrix / outer)
+    if factor is None:
+        inverse = np.linalg.pinv(matrix / outer, rcond=_SINGULAR,
+                                 hermitian=True)
+    else:
+        inverse = cho_solve((factor, True), np.eye(scale.size),
+                            check_finite=False)
+    return inverse / outer
+
+
+def _factor(matrix):
+    """Return the lower Cholesky factor, or None of a singular matrix."""
+    try:
+        factor = cholesky(matrix, lower=True, check_finite=False)
+    except np.linalg.LinAlgError:
+        return None
+    if not (np.diag(factor) ** 2 > _SINGULAR).all():
+        return None
+    return factor
 
 
 def _derivatives(model, x, y, parameters, free):
@@ -241,7 +298,7 @@ def _minimize(problem, max_steps):
         if step is None:
             damping = max(10 * damping, 1e-6)
             continue
-        length = _length(step, state)
+        length = state.length(step)
         new = problem.evaluate(state.values + step)
         if not new.chi2 <= state.chi2 * (1 + 1e-12):
             if length < 1e-3 * _TOLERANCE or damping > 1e12:
@@ -279,17 +336,10 @@ def _bounded_step(problem, state, damping):
         scale = state.scale[moves]
         matrix = state.matrix[np.ix_(moves, moves)] / np.outer(scale, scale)
         matrix[np.diag_indices_from(matrix)] += (damping[moves] / scale**2)
-        try:
-            factor = np.linalg.cholesky(matrix)
-        except np.linalg.LinAlgError:
+        factor = _factor(matrix)
+        if factor is None:
             return None
-        half = np.linalg.solve(factor, state.gradient[moves] / scale)
-        step[moves] = np.linalg.solve(factor.T, half) / scale
+        step[moves] = cho_solve((factor, True), state.gradient[moves] / scale,
+                                check_finite=False) / scale
     end = np.clip(state.values + step, problem.lower, problem.upper)
     return end - state.values
-
-
-def _length(step, state):
-    """Return the largest step, in tenths of its error or mils of its size."""
-    unit = 1e-3 * np.abs(state.values) + 0.1 / state.scale
-    return np.max(np.abs(step) / unit, initial=0)

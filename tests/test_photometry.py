@@ -364,6 +364,29 @@ def test_the_fitter_serves_photutils_in_groups(grid, rng):
     check_same(theirs, ours)
 
 
+@pytest.mark.parametrize('weighted', [False, True])
+def test_the_fitter_does_not_mind_the_unit_of_flux_or_the_origin(
+        rng, weighted):
+    psf = mixture(0.3)
+    y, x = np.mgrid[:11, :11]
+    noise = 0.001 * rng.standard_normal(x.shape)
+    data = psf.render(11, 5.3, 4.8) + noise
+    found = []
+    for flux, origin in ((1, 0), (1e-9, 0), (1e9, 0), (1, 2**14)):
+        model = MultiGaussianPSFModel(psf, flux=0.8 * flux, x_0=5 + origin,
+                                      y_0=5 + origin)
+        weights = np.full(x.shape, 1e3 / flux) if weighted else None
+        fitter = MixtureFitter()
+        fit = fitter(model, x + origin, y + origin, flux * data,
+                     weights=weights)
+        assert fitter.fit_info['status'] == 3
+        found.append([fit.flux.value / flux, fit.x_0.value - origin,
+                      fit.y_0.value - origin])
+    assert_allclose(found, [found[0]] * 4, rtol=0, atol=1e-8)
+    step = np.array(found[0]) - [1, 5.3, 4.8]
+    assert (abs(step) < [0.03, 0.03, 0.03]).all()
+
+
 def test_any_executor_gives_the_same_table(grid, rng):
     from concurrent.futures import ThreadPoolExecutor
     x, y, flux = isolated(rng)
