@@ -70,8 +70,8 @@ QUICK = Settings(
     resamplings=2000, draws=150, optics=(4, 7))
 
 FULL = Settings(
-    name='full', detectors=DETECTORS, size=1024, sky_size=2048,
-    crowded_size=768, grid=12, degree=3, psf_stars=300, sources=(614, 590),
+    name='full', detectors=DETECTORS, size=1024, sky_size=1536,
+    crowded_size=512, grid=12, degree=3, psf_stars=300, sources=(614, 590),
     references=100, resamplings=10000, draws=500, optics=(6, 13))
 
 
