@@ -359,7 +359,7 @@ def _finish(state, degree, workers, reject):
     for share, tolerance in ((0.3, 0.3), (0.3, 0.1), (1, 0.01)):
         _fit_blurs(state, workers)
         weigh(state, reject=reject, share=share)
-        advance(state, workers, tolerance=tolerance)
+        advance(state, workers, tolerance=tolerance, max_steps=8)
     for _ in range(_ADAPTATIONS if degree else 0):
         _adapt(state, workers, reject)
     return state
@@ -371,7 +371,7 @@ def _adapt(state, workers, reject):
         state.coefficients, state.equations.matrix,
         _groups(state.coefficients, state.problem.form.kinds))
     weigh(state, reject=reject)
-    advance(state, workers, tolerance=0.01)
+    advance(state, workers, tolerance=0.01, max_steps=10)
 
 
 def _groups(coefficients, kinds):
