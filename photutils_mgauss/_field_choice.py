@@ -7,7 +7,7 @@ from photutils_mgauss._field_fit import equations
 
 N_FOLDS = 3
 DEGREES = (0, 1, 2, 3, 4, 5)
-COMPONENTS = (2, 3, 4, 5, 6)
+COMPONENTS = (2, 3, 4, 5, 6, 7)
 # While the number of Gaussians is chosen, the degree is at most this.
 _DEGREE_FOR_COMPONENTS = 3
 

@@ -183,6 +183,7 @@ class Prior:
 
     mean: np.ndarray
     precision: np.ndarray
+    strength: float = 1.0
 
     @classmethod
     def about(cls, shapes, n_terms, width, strength=1.0):
@@ -192,11 +193,41 @@ class Prior:
         scale = np.array([1, width, width, 1, 1, 1])
         stddev = np.tile(_PRIOR_VARIATION * scale, (n_terms, len(shapes), 1))
         stddev[0] = _PRIOR_CONSTANT * scale
-        return cls(mean, strength / stddev**2)
+        return cls(mean, strength / stddev**2, strength)
 
     def first(self, n_terms):
         """Return the prior of the first terms."""
-        return Prior(self.mean[:n_terms], self.precision[:n_terms])
+        return replace(self, mean=self.mean[:n_terms],
+                       precision=self.precision[:n_terms])
+
+    def adapted(self, coefficients, matrix, groups):
+        r"""
+        Return the prior whose widths are those of what was found.
+
+        Each group of coefficients that vary over the field gets the variance
+        :math:`\langle c^2 + \sigma_c^2 \rangle`, a step towards the widths
+        under which the data are most likely (MacKay 1992, Neural
+        Computation 4, 415). High terms that are mostly noise are shrunk,
+        those that the stars ask for are not.
+
+        Parameters
+        ----------
+        coefficients : (T, K, 6) `~numpy.ndarray`
+        matrix : (N, N) `~numpy.ndarray`
+            The normal equations at them, without the prior.
+        groups : (T, K, 6) `~numpy.ndarray` of int
+            The group of each coefficient, -1 for those to leave alone.
+        """
+        n_terms, k, _ = coefficients.shape
+        posterior = np.diag(np.linalg.inv(
+            matrix + np.diag(to_vector(self.precision))))
+        squares = coefficients**2 + to_coefficients(posterior, n_terms, k)
+        ratio = squares * self.precision / self.strength
+        precision = self.precision.copy()
+        for group in np.unique(groups[groups >= 0]):
+            inside = groups == group
+            precision[inside] /= np.mean(ratio[inside])
+        return replace(self, precision=precision)
 
     def cost(self, coefficients):
         """Return the chi^2 of coefficients."""

@@ -26,6 +26,10 @@ _PIXEL_LIMIT = 5.0
 _STAR_LIMIT = 6.0
 _STAR_EXCESS = 0.3
 _MAX_DEVIANT_PIXELS = 0.1
+# How often the prior takes the widths of the coefficients found under it.
+_ADAPTATIONS = 3
+# Log weight, means and precisions of a Gaussian vary by different amounts.
+_KINDS = np.array([0, 1, 1, 2, 2, 2])
 # Relative error of the PSF assumed before anything is known of it.
 _FIRST_ACCURACY = 0.1
 
@@ -58,6 +62,11 @@ class FieldFit:
 def n_terms(degree):
     """Return the number of terms of a polynomial of x and y."""
     return (degree + 1) * (degree + 2) // 2
+
+
+def term_degrees(n):
+    """Return the degrees of the first n terms."""
+    return np.repeat(np.arange(n), np.arange(n) + 1)[:n]
 
 
 def polynomials(u, v, degree):
@@ -246,7 +255,8 @@ def degrees(problem, n_components, top, strength, workers):
     """Yield the coefficients of each degree from 0 to the top one."""
     state = _first_state(problem, n_components, top, strength, workers)
     for degree in range(top + 1):
-        _stage(state, np.arange(len(problem.basis)), degree, workers, True)
+        _stage(state, np.arange(len(problem.basis)), degree, workers, True,
+               adapt=True)
         yield state.coefficients
 
 
@@ -257,7 +267,7 @@ def _first_state(problem, n_components, degree, strength, workers):
                     np.zeros(problem.stamps.good.shape, bool))
 
 
-def _stage(state, index, degree, workers, reject):
+def _stage(state, index, degree, workers, reject, *, adapt=False):
     """Fit some of the stars at a low degree; only coefficients remain."""
     terms = n_terms(degree)
     few = state.problem.subset(index)
@@ -269,6 +279,8 @@ def _stage(state, index, degree, workers, reject):
     for _ in range(2):
         weigh(part, reject=reject, share=0.5)
         advance(part, workers, tolerance=0.3, max_steps=10)
+    if adapt and degree:
+        _adapt(part, workers, reject)
     state.coefficients, state.accuracy = part.coefficients, part.accuracy
 
 
@@ -286,7 +298,23 @@ def _finish(state, degree, workers, reject):
     for share, tolerance in ((0.3, 0.3), (0.3, 0.1), (1, 0.01)):
         weigh(state, reject=reject, share=share)
         advance(state, workers, tolerance=tolerance)
+    for _ in range(_ADAPTATIONS if degree else 0):
+        _adapt(state, workers, reject)
     return state
+
+
+def _adapt(state, workers, reject):
+    """Let the prior follow the coefficients, and these the prior."""
+    degrees = term_degrees(len(state.coefficients))
+    groups = 3 * (degrees[:, None, None] - 1) + _KINDS
+    groups = np.repeat(groups, state.coefficients.shape[1], axis=1)
+    groups[0] = -1
+    # Not fitted: they would repeat position and flux of the stars.
+    groups[:, 0, :3] = -1
+    state.prior = state.prior.adapted(state.coefficients,
+                                      state.equations.matrix, groups)
+    weigh(state, reject=reject)
+    advance(state, workers, tolerance=0.01)
 
 
 def _raised(coefficients, terms):

@@ -257,8 +257,8 @@ def _mixture_arrays(shapes):
     return weights, means, covariances, shift
 
 
-def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=5,
-                      degree=3, radius=10, local_bkg=False,
+def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
+                      degree=4, radius=10, local_bkg=False,
                       effective_gain=None, reject=True, regularization=1.0,
                       executor=None):
     """
@@ -285,12 +285,14 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=5,
         True for pixels to leave out. Pixels that are not finite, or whose
         error is not positive, are left out, too.
     n_components : int or 'auto', optional
-        The number K of Gaussians; 'auto' tries 2 to 6 and keeps the number
+        The number K of Gaussians; 'auto' tries 2 to 7 and keeps the number
         that describes stars left out of the fit best.
     degree : int or 'auto', optional
         The degree of the polynomials, 0 for a PSF that is the same
         everywhere. It is lowered, with a warning, if there are too few stars.
-        'auto' tries 0 to 5 in the same way.
+        'auto' tries 0 to 5 in the same way. High terms are shrunk by as much
+        as the stars do not ask for them, so that a degree that is too high
+        costs time more than accuracy.
     radius : float, optional
         The radius of the circle of pixels that is fitted [pix].
     local_bkg : bool, optional
@@ -305,7 +307,8 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=5,
         Whether to drop deviant stars and pixels.
     regularization : float, optional
         The strength of the prior on the shapes, 1 for the default. It keeps
-        Gaussians apart that the stars cannot tell from each other.
+        Gaussians apart that the stars cannot tell from each other. How much
+        the shapes vary over the field is learnt from the stars.
     executor : `~concurrent.futures.Executor`, optional
         Where stars are worked on; by default a pool of threads.
 
