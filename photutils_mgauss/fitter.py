@@ -30,8 +30,8 @@ _TOLERANCE = 1e-6
 
 # What fraction of the fall of chi2 that the normal equations promise a step
 # should bring: below the first damping grows, above the second it falls.
-_POOR_GAIN = 0.25
-_FAIR_GAIN = 0.75
+POOR_GAIN = 0.25
+FAIR_GAIN = 0.75
 
 # The least factor by which steps are taken to get shorter.
 _LEAST_RATE = 0.03
@@ -323,7 +323,7 @@ def _minimize(problem, max_steps):
         state = new
         if _remainder(length, last) < _TOLERANCE:
             return state, 3, n + 2
-        last, damping = length, _next_damping(damping, gain)
+        last, damping = length, next_damping(damping, gain)
     status = 2 if fall < _LEAST_FALL * state.chi2 else 0
     return state, status, max_steps + 1
 
@@ -334,15 +334,19 @@ def _gain(state, new, step):
     if expected > 1e-9 * state.chi2:
         return (state.chi2 - new.chi2) / expected
     # Of a smaller fall nothing is left after rounding: keep the damping.
-    return _POOR_GAIN
+    return POOR_GAIN
 
 
-def _next_damping(damping, gain):
-    # A faint star needs some even at its minimum, where the curvature that
-    # the normal matrix leaves out makes undamped steps overshoot.
-    if gain < _POOR_GAIN:
+def next_damping(damping, gain):
+    """
+    Return the damping after a step that brought gain of what it promised.
+
+    A faint star needs some even at its minimum, where the curvature that the
+    normal matrix leaves out makes undamped steps overshoot.
+    """
+    if gain < POOR_GAIN:
         return max(4 * damping, 1e-2)
-    if gain < _FAIR_GAIN:
+    if gain < FAIR_GAIN:
         return damping
     return damping / 10 if damping > 1e-4 else 0.0
 

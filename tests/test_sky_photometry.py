@@ -132,6 +132,14 @@ def test_positions_at_the_pole_have_errors_along_the_parallel():
         assert_allclose(table[name].value, 0.72, rtol=1e-6)
 
 
+def test_faint_stars_converge_in_one_image_and_in_three(rng):
+    # At a signal to noise of four; where undamped steps have to do, one in
+    # seven does not.
+    for n, flux in ((1, 180.0), (3, 120.0)):
+        sky, frames = images(rng, flux, n)
+        assert np.mean(fit_many(frames, sky)['converged']) > 0.95
+
+
 def real_or_linear_wcs(request, realdata):
     """Return a gwcs of a real instrument, or a FITS WCS."""
     if request == 'fits':
