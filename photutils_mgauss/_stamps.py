@@ -192,19 +192,19 @@ def refine_astrometry(stamp, problem, spaces, solution):
     """
     for price in _ASTROMETRY:
         mapped, solution = _price(stamp, problem, spaces, solution, price)
-        best, stopped = solution, True
+        best = solution
         for _ in range(_ASTROMETRY_ROUNDS):
+            before = solution.cost
             trial = run(mapped, problem, spaces, solution.shapes,
                         _ASTROMETRY_STEPS)
-            mapped, trial = _price(stamp, problem, spaces, trial, price)
-            change = abs(trial.cost - solution.cost)
-            solution = trial
+            mapped, solution = _price(stamp, problem, spaces, trial, price)
+            small = _ASTROMETRY_TOLERANCE * best.cost
+            improving = solution.cost < best.cost - small
             best = min(best, solution, key=lambda each: each.cost)
-            if change < _ASTROMETRY_TOLERANCE * best.cost:
-                stopped = False
+            if abs(solution.cost - before) < small:
                 break
         solution = best
-    return solution._replace(stopped=stopped)
+    return solution._replace(stopped=improving)
 
 
 def _price(stamp, problem, spaces, solution, price):

@@ -189,7 +189,8 @@ def phase(stamps, arguments):
     epsfs = hubble_epsfs(Path(folder))
     inner = epsfs[1:-1, 1:-1].reshape(-1, *epsfs.shape[2:])
     for k in (3, 5, 8):
-        print_phases('F814W, inner nodes', inner, 4, k, 'astrometric')
+        for weighting in ('uniform', 'astrometric'):
+            print_phases('F814W, inner nodes', inner, 4, k, weighting)
     print_phases('F814W, all nodes', epsfs.reshape(-1, *epsfs.shape[2:]), 4,
                  8, 'astrometric')
 
