@@ -16,6 +16,7 @@ from photutils.background import Background2D
 from photutils.detection import DAOStarFinder
 from scipy.spatial import cKDTree
 
+from photutils_mgauss._cli_tools import whole_file
 from photutils_mgauss.field import fit_mixture_field
 from photutils_mgauss.gridded import GriddedMixturePSF
 from photutils_mgauss.photometry import MixturePSFPhotometry
@@ -174,15 +175,28 @@ def _match(stars, sources):
 def write(result, folder):
     """Write PSF grids, catalogues, motions and frames; return the paths."""
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     for number, epoch in enumerate(result.epochs, 1):
-        epoch.psf.write(folder / f'psf_{number}.fits', overwrite=True)
-        epoch.catalogue.write(folder / f'catalogue_{number}.ecsv',
-                              overwrite=True)
+        _write_whole(epoch.psf, folder / f'psf_{number}.fits')
+        _write_whole(epoch.catalogue, folder / f'catalogue_{number}.ecsv')
     for name, table in (('motions', result.solution.stars),
                         ('alignment', result.solution.alignment)):
-        table.write(folder / f'{name}.ecsv', overwrite=True)
-        table.write(folder / f'{name}.fits', overwrite=True)
+        _write_whole(table, folder / f'{name}.ecsv')
+        _write_whole(table, folder / f'{name}.fits')
+    return sorted(folder.glob('*'))
+
+
+def _write_whole(what, path):
+    with whole_file(path) as draft:
+        what.write(draft)
+
+
+def write_images(scenes, sources, folder):
+    """Write the images and the quasars among the sources; return paths."""
+    for number, scene in enumerate(scenes, 1):
+        scene.write(folder / f'night{number}.fits', overwrite=True)
+    quasars = sources[sources['kind'] == 'qso']['ra', 'dec']
+    quasars['class'] = 'qso'
+    _write_whole(quasars, folder / 'quasars.ecsv')
     return sorted(folder.glob('*'))
 
 

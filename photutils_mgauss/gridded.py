@@ -619,7 +619,7 @@ n_components=1)>
         """
         stars = np.broadcast_arrays(*(as_floats(value, name) for value, name
                                       in ((x, 'x'), (y, 'y'), (flux, 'flux'))))
-        x, y, flux = (np.atleast_1d(np.ascontiguousarray(a)) for a in stars)
+        x, y, flux = (np.array(a, ndmin=1) for a in stars)
         ny, nx = as_shape(shape, 'shape')
         out = np.zeros((x.size, ny, nx))
         self._run(2, x, y, flux, np.rint(x) - (nx - 1) // 2,

@@ -11,6 +11,7 @@ from photutils_mgauss.shapes import adaptive_moments
 __all__ = [
     'plot_comparison',
     'plot_comparison_of_numbers',
+    'plot_detections',
     'plot_ellipses',
     'plot_error_curve',
     'plot_errors_by_epochs',
@@ -21,11 +22,14 @@ __all__ = [
     'plot_profile',
     'plot_projection',
     'plot_proper_motions',
+    'plot_psf_image',
     'plot_residual',
     'plot_residual_vectors',
     'plot_shape_map',
+    'plot_stated_errors',
     'plot_trace',
     'plot_whiskers',
+    'plot_width_map',
     'plot_worst_node',
 ]
 
@@ -737,5 +741,128 @@ def plot_errors_by_epochs(ax, solutions):
         ax.plot(counts, medians, 'o-', color=colour, label=name)
     unit = solutions[0].stars['pmra'].unit
     ax.set(xlabel='number of epochs', ylabel=f'median error [{unit}]')
+    ax.legend()
+    return ax
+
+
+# What a run of the command line made.
+
+def plot_psf_image(ax, psf, x, y, *, radius=8, decades=4):
+    """
+    Show the PSF at a place, in logarithms.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Where to draw.
+    psf : GriddedMixturePSF
+        The PSF.
+    x, y : float
+        The place on the detector [pix].
+    radius : float, optional
+        Half the width of the image [pix].
+    decades : float, optional
+        How many powers of ten below the peak are shown.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        The same.
+    """
+    points = np.linspace(-radius, radius, 161)
+    image = psf.mixture_at(x, y).evaluate(
+        points, points[:, None], pixel_integrated=psf.pixel_integrated)
+    peak = image.max()
+    shown = ax.imshow(
+        np.log10(np.maximum(image / peak, 10.0 ** -decades)), origin='lower',
+        cmap='cividis', extent=(-radius, radius, -radius, radius))
+    ax.figure.colorbar(shown, ax=ax, label='log of value / peak')
+    ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal',
+           title=f'the PSF at ({x:.0f}, {y:.0f})')
+    return ax
+
+
+def plot_width_map(ax, psf):
+    r"""
+    Map the width of the nodes' PSFs, :math:`2.35 \sqrt{R^2 / 2}`.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Where to draw.
+    psf : GriddedMixturePSF
+        The PSF.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        The same.
+    """
+    fwhm = 2.3548 * np.sqrt(adaptive_moments(psf.mixtures).r2 / 2)
+    x, y = psf.grid_xypos.T
+    points = ax.scatter(x, y, c=fwhm, s=12, marker='s', cmap='cividis')
+    ax.figure.colorbar(points, ax=ax, label='FWHM [pix]')
+    ax.set_title(f'FWHM: median {np.median(fwhm):.3f}, '
+                 f'range {np.ptp(fwhm):.2g} pix')
+    return _focal_plane(ax, {'': psf}, {'': (0, 0)})
+
+
+def plot_detections(ax, x, y, flux, *, psf_stars=None):
+    """
+    Map the stars of a catalogue, brighter ones larger.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Where to draw.
+    x, y, flux : (n,) array_like
+        Positions [pix] and fluxes.
+    psf_stars : (m, 2) array_like, optional
+        The positions of stars to mark.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        The same.
+    """
+    flux = np.maximum(np.nan_to_num(flux), 1e-300)
+    size = np.clip(np.log10(flux / np.percentile(flux, 5)), 0.1, 3)
+    ax.scatter(x, y, s=4 * size**2, color=BLACK, linewidths=0, alpha=0.7)
+    if psf_stars is not None and len(psf_stars):
+        ax.scatter(*np.transpose(psf_stars), s=40, facecolors='none',
+                   edgecolors=ORANGE, label='stars of the PSF')
+        ax.legend()
+    ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal',
+           title=f'{len(flux)} stars')
+    return ax
+
+
+def plot_stated_errors(ax, magnitude, errors, *, unit, label=None):
+    """
+    Plot the stated errors of stars against their magnitudes.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Where to draw.
+    magnitude : (n,) array_like
+        Magnitudes [mag].
+    errors : dict of (n,) array_like
+        One or several errors by name.
+    unit : str
+        Their unit.
+    label : str, optional
+        What the magnitudes are.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        The same.
+    """
+    for (name, values), colour in zip(errors.items(), _CYCLE, strict=False):
+        ax.plot(magnitude, values, '.', color=colour, markersize=3,
+                label=name)
+    ax.set(yscale='log', xlabel=label or 'magnitude [mag]',
+           ylabel=f'stated error [{unit}]')
     ax.legend()
     return ax

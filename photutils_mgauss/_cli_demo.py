@@ -1,0 +1,82 @@
+"""``mgauss demo``: simulated images to motions beside the truth."""
+from pathlib import Path
+
+from tqdm import tqdm
+
+from photutils_mgauss import _cli_tools as tools
+
+
+def add(commands):
+    """Add the command to the parser's."""
+    demo = tools.command(
+        commands, 'demo', 'simulate a field at several epochs and measure it',
+        'Simulate a small field at several epochs, make the PSF of each '
+        'image from its own\nstars, measure all stars, align the epochs on '
+        'quasars, fit proper motions, and\ncompare them with the truth.',
+        'mgauss demo --epochs 3 --output my_demo', run)
+    demo.add_argument('--output', default='mgauss_demo', metavar='FOLDER',
+                      help='where files go (default: %(default)s)')
+    demo.add_argument('--epochs', type=int, choices=range(2, 8), default=5,
+                      help='number of epochs (default: %(default)s)')
+    demo.add_argument('--size', type=tools.count, default=1024,
+                      metavar='PIXELS',
+                      help='side of the detector (default: %(default)s)')
+    demo.add_argument('--seed', type=int, default=1,
+                      help='of the simulation (default: %(default)s)')
+    demo.add_argument('--images-only', action='store_true',
+                      help='write the images, as FITS, and the quasars, and '
+                           'measure nothing: something to try the other '
+                           'commands on')
+    tools.add_manners(demo)
+
+
+def run(options):
+    """Run the demonstration."""
+    folder = Path(options.output)
+    if folder.exists() and any(folder.iterdir()) and not options.overwrite:
+        msg = (f'{folder} has files in it; choose another --output or add '
+               '--overwrite')
+        raise FileExistsError(msg)
+    folder.mkdir(parents=True, exist_ok=True)
+    from photutils_mgauss import _demo
+
+    def progress(steps, words):
+        return tqdm(steps, desc=f'{words:10}', unit='epoch',
+                    disable=options.quiet)
+
+    sources, scenes = _demo.take_images(_settings(options, _demo), progress)
+    if options.images_only:
+        paths = _demo.write_images(scenes, sources, folder)
+    else:
+        measured = [_demo.measure(scene)
+                    for scene in progress(scenes, 'measure')]
+        result = _demo.find_motions(measured, sources)
+        paths = _demo.write(result, folder) + _draw(options, result, folder)
+        tools.say(options, *_demo.summary(result))
+    tools.say(options, '', f'{len(paths)} files in {folder}')
+
+
+def _settings(options, demo):
+    density = (options.size / 1024) ** 2
+    return demo.Settings(
+        n_epochs=options.epochs, size=options.size, seed=options.seed,
+        n_stars=round(350 * density), n_qsos=round(120 * density))
+
+
+def _draw(options, result, folder):
+    """Draw the two figures if matplotlib is there; return their paths."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        tools.say(options, 'no figures: matplotlib is not installed')
+        return []
+    from photutils_mgauss import _demo
+    paths = []
+    for name, plot in (('positions', _demo.plot_positions),
+                       ('motions', _demo.plot_motions)):
+        figure = Figure(figsize=(9, 4), layout='constrained')
+        plot(result, figure.subplots(1, 2))
+        paths.append(folder / f'{name}.png')
+        with tools.whole_file(paths[-1]) as draft:
+            figure.savefig(draft, dpi=150)
+    return paths

@@ -1,0 +1,310 @@
+"""``mgauss motions``: catalogues or images to motions and corrected WCS."""
+import json
+from pathlib import Path
+
+from photutils_mgauss import _cli_photometry as photometry
+from photutils_mgauss import _cli_psf as psf_command
+from photutils_mgauss import _cli_tools as tools
+
+_TABLE_SUFFIXES = ('.ecsv', '.csv', '.txt', '.dat', '.vot', '.xml', '.votable')
+
+# Running numbers of one image are no names of stars.
+_NUMBERS = ('id', 'group_id')
+
+
+def add(commands):
+    """Add the command to the parser's."""
+    parser = tools.command(
+        commands, 'motions', 'proper motions and corrected WCS',
+        'Match the stars of two or more exposures, align the exposures on '
+        'objects of known\nmotion, and fit proper motions. Inputs are '
+        'catalogues, of mgauss photometry or with\nra, dec and their errors, '
+        'or images, which are measured first. Without references\nthe '
+        'motions are relative to the mean of the stars.',
+        'mgauss motions night1_cat.ecsv night2_cat.ecsv '
+        '--references quasars.ecsv', run)
+    parser.add_argument('inputs', nargs='+', metavar='FILE',
+                        help='a catalogue or an image of each exposure')
+    parser.add_argument('--output', default='mgauss_motions',
+                        metavar='FOLDER',
+                        help='where files go (default: %(default)s)')
+    parser.add_argument('--format', choices=('ecsv', 'fits'), default='ecsv',
+                        help='of the tables (default: %(default)s)')
+    _add_solution(parser)
+    tools.add_times(parser)
+    psf_command.add_fit(parser)
+    photometry.add_measuring(parser)
+    tools.add_reading(parser)
+    tools.add_manners(parser)
+    parser.set_defaults(grid_shape=[30, 30])
+
+
+def _add_solution(parser):
+    group = parser.add_argument_group('the motions')
+    group.add_argument('--references', metavar='TABLE',
+                       help='objects of known motion: ra, dec and class (qso, '
+                            'galaxy, star, position), or a table of Gaia')
+    group.add_argument('--reference-class', metavar='CLASS',
+                       choices=('qso', 'galaxy', 'star', 'position'),
+                       help='class of all references, for tables without '
+                            'that column')
+    group.add_argument('--transform', default='affine',
+                       help='what may differ between exposures: shift, '
+                            'rigid, similarity, affine, poly-2, ... '
+                            '(default: %(default)s)')
+    group.add_argument('--recipe', choices=('joint', 'two-step', 'paper'),
+                       default='joint', help='default: %(default)s')
+    group.add_argument('--parallax', action='store_true',
+                       help='fit parallaxes, too')
+    group.add_argument('--observer', choices=('earth', 'leo', 'l2'),
+                       help='from where parallaxes are seen')
+    group.add_argument('--max-motion', type=tools.positive, default=50,
+                       metavar='MAS/YR', help='largest motion considered in '
+                       'matching (default: %(default)s)')
+    group.add_argument('--match-radius', type=tools.positive, metavar='MAS',
+                       help='largest distance of a match (default: from the '
+                            'errors)')
+    group.add_argument('--good-flags', type=int, default=0, metavar='BITS',
+                       help='sum of the flags of detections to be used all '
+                            'the same')
+    group.add_argument('--plane', action='store_true',
+                       help='take pixels for coordinates, without WCS')
+
+
+def run(options):
+    """Measure the motions."""
+    paths = options.inputs
+    _check(options)
+    folder = Path(options.output)
+    are_tables = [is_table(path) for path in paths]
+    names = _Names(folder, paths, are_tables, options.format)
+    tools.claim(names.all(), options.overwrite)
+    with tools.Progress(len(paths) + 2, options.quiet) as step:
+        epochs = _epochs(options, paths, are_tables, names, step)
+        step('align and fit')
+        solution = _fit(epochs, options)
+        step(f'write to {folder}')
+        _write(solution, names, options)
+    tools.say(options, *_summary(solution), f'files are in {folder}')
+
+
+def _check(options):
+    """Raise for what is wrong before anything is read."""
+    tools.check_inputs([*options.inputs, *filter(None, [options.references])])
+    if len(options.inputs) < 2:
+        msg = (f'inputs must be at least 2 exposures, got only '
+               f'{options.inputs[0]}')
+        raise ValueError(msg)
+    folder = Path(options.output)
+    if folder.exists() and not folder.is_dir():
+        msg = f'{folder}: --output must be a folder, but is a file'
+        raise NotADirectoryError(msg)
+
+
+def is_table(path):
+    """Whether a file is a table rather than an image."""
+    if Path(path).suffix.lower() in _TABLE_SUFFIXES:
+        return True
+    from photutils_mgauss._image_layers import is_asdf, open_fits
+    if is_asdf(path):
+        return False
+    with open_fits(path) as hdus:
+        images = [hdu for hdu in hdus if hdu.is_image
+                  and hdu.header.get('NAXIS', 0) >= 2]
+        return not images and len(hdus) > 1
+
+
+class _Names:
+    """The names of all files of a run."""
+
+    def __init__(self, folder, paths, are_tables, form):
+        def named(ending, suffix):
+            return tools.output_names(paths, str(folder), ending, (), suffix)
+        self.tables = {name: folder / f'{name}.{form}' for name in
+                       ('motions', 'alignment', 'residuals')}
+        images = [not table for table in are_tables]
+        self.psfs = _where(images, named('_psf', '.fits'))
+        self.catalogues = _where(images, named('_cat', f'.{form}'))
+        self.wcs = [name.with_suffix('') for name in named('_wcs', '.fits')]
+
+    def all(self):
+        """Return every name that may be written to."""
+        wcs = [name.with_suffix(suffix) for name in self.wcs
+               for suffix in ('.fits', '.asdf')]
+        return [*self.tables.values(), *filter(None, self.psfs),
+                *filter(None, self.catalogues), *wcs]
+
+
+def _where(chosen, names):
+    return [name if yes else None
+            for yes, name in zip(chosen, names, strict=True)]
+
+
+def _epochs(options, paths, are_tables, names, step):
+    read = tools.read_images(options, paths)
+    epochs = []
+    for i, path in enumerate(paths):
+        step(f'read {path}' if are_tables[i] else f'measure {path}')
+        if are_tables[i]:
+            epochs.append(_from_catalogue(options, i))
+        else:
+            epochs.append(_from_image(options, read(i), names, i))
+        tools.say(options, f'{path}: {epochs[-1]!r}')
+    return epochs
+
+
+def _from_image(options, image, names, i):
+    """Return the epoch of an image; write its PSF and catalogue."""
+    if image.wcs is None and not options.plane:
+        raise ValueError(_no_sky(image.path))
+    psf, found = psf_command.from_stars(image, options)
+    psf_command.write(psf, names.psfs[i], tools.record_of(
+        options, input=str(image.path), **found))
+    table = photometry.measure(image, psf, options)
+    exposure = photometry.exposure(image, names.catalogues[i])
+    tools.write_table(table, names.catalogues[i],
+                      tools.record_of(options, exposure=exposure))
+    return _epoch(options, image.path, table, image.wcs, image.time)
+
+
+def _from_catalogue(options, i):
+    path = options.inputs[i]
+    table, record = tools.read_table(path)
+    exposure = record.get('exposure', {})
+    time = tools.parse_time(tools.one_each(options.time, len(options.inputs),
+                                           'time')[i])
+    if time is None:
+        time = exposure.get('time')
+    return _epoch(options, path, table, _wcs_of(options, i, record), time)
+
+
+def _wcs_of(options, i, record):
+    """Return the WCS named by an option, or that of the record's image."""
+    from photutils_mgauss._image_layers import read_wcs
+    from photutils_mgauss._images import Reading, read_image
+    given = tools.one_each(options.wcs, len(options.inputs), 'wcs')[i]
+    if given is not None:
+        return read_wcs(given)
+    image = record.get('exposure', {}).get('image')
+    if image is None:
+        return None
+    image = Path(options.inputs[i]).resolve().parent / image
+    if not image.exists():
+        tools.say(options, f'{options.inputs[i]}: its image {image} is not '
+                  'there; the places on the sky are used as they are')
+        return None
+    used = record.get('options', {})
+    wcs = used.get('wcs')
+    if wcs and len(used.get('inputs', [])) == 1 and Path(wcs[0]).exists():
+        return read_wcs(wcs[0])
+    return read_image(image, Reading(ext=used.get('ext'))).wcs
+
+
+def _epoch(options, path, table, wcs, time):
+    """Return the `Epoch` of a table, its flagged rows left out."""
+    from photutils_mgauss.proper_motion import Epoch
+    if time is None and 'time' not in table.colnames:
+        msg = (f'{path}: the time must be known; the header has none, give '
+               '--time')
+        raise ValueError(msg)
+    table = _usable(table, options.good_flags)
+    wcs = None if options.plane else wcs
+    if wcs is None and not options.plane:
+        table = _on_the_sky(path, table)
+    try:
+        return Epoch(table, wcs, time, observer=options.observer)
+    except (TypeError, ValueError) as error:
+        msg = f'{path}: {error}'
+        raise ValueError(msg) from error
+
+
+def _usable(table, good_flags):
+    if 'flags' in table.colnames:
+        flags = table['flags'].astype(int)
+        table = table[(flags & ~good_flags) == 0]
+    # Where photutils' columns are, numbers are those of one image.
+    running = _NUMBERS if 'x_fit' in table.colnames else ()
+    return table[[name for name in table.colnames if name not in running]]
+
+
+def _on_the_sky(path, table):
+    """Return a table of places on the sky, with their covariance."""
+    if 'ra' not in table.colnames or 'dec' not in table.colnames:
+        raise ValueError(_no_sky(path))
+    table = table.copy()
+    if 'xy_cov' in table.colnames:
+        table.remove_column('xy_cov')
+    if 'radec_cov' in table.colnames:
+        table['xy_cov'] = table['radec_cov']
+    return table
+
+
+def _no_sky(path):
+    return (f'{path}: must have a WCS or columns ra and dec, got neither; '
+            'give --wcs, or --plane for motions in pixels')
+
+
+def _fit(epochs, options):
+    import astropy.units as u
+
+    from photutils_mgauss.proper_motion import ProperMotionFitter
+    radius = options.match_radius
+    fitter = ProperMotionFitter(
+        transform=options.transform, recipe=options.recipe,
+        parallax=options.parallax, references=_references(options),
+        max_motion=options.max_motion * u.mas / u.yr,
+        match_radius=None if radius is None else radius * u.mas)
+    return fitter.fit(epochs)
+
+
+def _references(options):
+    if options.references is None:
+        return None
+    table, _ = tools.read_table(options.references)
+    if options.reference_class is not None:
+        table['class'] = options.reference_class
+    # Identifiers of another catalogue say nothing about these stars.
+    return table[[name for name in table.colnames if name != 'id']]
+
+
+def _write(solution, names, options):
+    for name, path in names.tables.items():
+        table = getattr(solution, 'stars' if name == 'motions' else name)
+        tools.write_table(table, path, tools.record_of(
+            options, notes=list(solution.notes)))
+    for epoch, name in zip(solution.epochs, names.wcs, strict=True):
+        if epoch.wcs is not None:
+            write_wcs(epoch, name, tools.record_of(options))
+
+
+def write_wcs(epoch, name, record):
+    """Write a WCS: a gwcs as ASDF, any other as a FITS header."""
+    from gwcs import WCS as GWCS
+    if isinstance(epoch.wcs, GWCS):
+        import asdf
+        with tools.whole_file(name.with_suffix('.asdf')) as draft:
+            asdf.AsdfFile({'wcs': epoch.wcs, 'mgauss': record}).write_to(
+                draft)
+        return
+    from astropy.io import fits
+
+    from photutils_mgauss._parallax import tdb
+    header = epoch.wcs.to_header(relax=True)
+    header['MJD-AVG'] = tdb(epoch.mean_year).mjd, 'middle of the exposure'
+    header['TIMESYS'] = 'TDB'
+    header['MGRUN'] = json.dumps(record)
+    with tools.whole_file(name.with_suffix('.fits')) as draft:
+        fits.PrimaryHDU(header=header).writeto(draft)
+
+
+def _summary(solution):
+    """Return lines on what came out."""
+    import numpy as np
+    stars = solution.stars
+    errors = [stars[name] for name in ('pmra_error', 'pmdec_error')]
+    solved = np.isfinite(errors[0].value)
+    lines = [f'{solved.sum()} of {len(stars)} stars have proper motions']
+    if solved.any():
+        median = np.median([error.value[solved] for error in errors])
+        lines.append(f'median error {median:.3g} {errors[0].unit}')
+    return [*lines, *(f'note: {note}' for note in solution.notes)]

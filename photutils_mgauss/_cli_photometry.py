@@ -1,0 +1,148 @@
+"""``mgauss photometry``: images and PSFs to catalogues."""
+import os
+
+from photutils_mgauss import _cli_tools as tools
+
+_SUFFIXES = ('.ecsv', '.fits')
+
+# Columns in the unit of the image.
+_FLUXES = ('flux_init', 'flux_fit', 'flux_err', 'local_bkg', 'sky',
+           'sky_err')
+
+
+def add(commands):
+    """Add the command to the parser's."""
+    parser = tools.command(
+        commands, 'photometry', 'positions and fluxes of the stars in images',
+        'Find the stars of each image and fit their positions and fluxes. '
+        "The catalogue has\nphotutils' columns and, if the image has a WCS, "
+        'places on the sky with covariances.',
+        'mgauss photometry night1.fits --psf night1_psf.fits', run)
+    parser.add_argument('inputs', nargs='+', metavar='IMAGE', help='images')
+    parser.add_argument('--psf', nargs='+', required=True, metavar='FILE',
+                        help='PSF of all images, or one for each: a file of '
+                             'mgauss psf, or any it could read')
+    parser.add_argument('--output', metavar='NAME',
+                        help='folder, or for a single image a file: .ecsv or '
+                             '.fits (default: IMAGE_cat.ecsv)')
+    add_measuring(parser)
+    tools.add_times(parser)
+    tools.add_reading(parser)
+    tools.add_manners(parser)
+
+
+def add_measuring(parser):
+    """Add the options of the measurement."""
+    group = parser.add_argument_group('the measurement')
+    group.add_argument('--crowded', action='store_true',
+                       help='find and fit all stars and the sky together')
+    group.add_argument('--threshold', type=tools.positive, metavar='SIGMA',
+                       help='significance of the faintest stars (default: 5, '
+                            'or 4.5 with --crowded)')
+    group.add_argument('--fit-shape', type=tools.count, default=11,
+                       metavar='PIXELS', help='side of the fitted region, '
+                       'odd (default: %(default)s)')
+
+
+def run(options):
+    """Measure the images."""
+    paths = options.inputs
+    tools.check_inputs([*paths, *options.psf])
+    names = tools.output_names(paths, options.output, '_cat', _SUFFIXES,
+                               '.ecsv')
+    psfs = tools.one_each(options.psf, len(paths), 'psf')
+    tools.claim(names, options.overwrite)
+    read = tools.read_images(options, paths)
+    with tools.Progress(3 * len(names), options.quiet) as step:
+        for i, name in enumerate(names):
+            step(f'read {paths[i]}')
+            image, psf = read(i), _read_psf(psfs[i])
+            tools.say(options, image.describe())
+            step(f'measure {paths[i]}')
+            table = measure(image, psf, options)
+            step(f'write {name}')
+            record = tools.record_of(options, exposure=exposure(image, name),
+                                     psf=str(psfs[i]),
+                                     reading=image.layers.sources)
+            tools.write_table(table, name, record)
+            tools.say(options, f'{name}: {len(table)} stars')
+
+
+def _read_psf(path):
+    from photutils_mgauss._psf_files import read_psf
+    return read_psf(path)
+
+
+def measure(image, psf, options):
+    """Return the catalogue of an image."""
+    try:
+        table = (_crowded if options.crowded else _sparse)(image, psf,
+                                                           options)
+    except ValueError as error:
+        msg = f'{image.path}: {error}'
+        raise ValueError(msg) from error
+    if table is None or len(table) == 0:
+        msg = f'{image.path}: must show a star, got none; try --threshold'
+        raise ValueError(msg)
+    return _with_sky(_with_unit(table, image.unit), image)
+
+
+def _sparse(image, psf, options):
+    from photutils.detection import DAOStarFinder
+
+    from photutils_mgauss.photometry import MixturePSFPhotometry
+    fwhm = _fwhm(psf, image.data.shape)
+    threshold = options.threshold or 5.0
+    finder = DAOStarFinder(threshold * float(
+        image.sky.background_rms_median), fwhm)
+    noise = image.noise
+    photometry = MixturePSFPhotometry(
+        psf, options.fit_shape, finder=finder,
+        aperture_radius=max(2.0, 1.5 * fwhm), effective_gain=noise.gain,
+        xy_cov=True)
+    return photometry(image.without_sky, error=noise.background,
+                      mask=image.mask)
+
+
+def _crowded(image, psf, options):
+    from photutils_mgauss.crowded import CrowdedMixturePhotometry
+    photometry = CrowdedMixturePhotometry(
+        psf, threshold=options.threshold or 4.5,
+        effective_gain=image.noise.gain)
+    return photometry(image.data, error=image.noise.total, mask=image.mask)
+
+
+def _fwhm(psf, shape):
+    """Return the width of the PSF in the middle of the image [pix]."""
+    from photutils_mgauss.shapes import adaptive_moments
+    ny, nx = shape
+    r2 = float(adaptive_moments(psf.mixture_at(nx / 2, ny / 2)).r2)
+    return 2.3548 * (r2 / 2) ** 0.5
+
+
+def _with_unit(table, unit):
+    if unit is not None:
+        for name in _FLUXES:
+            if name in table.colnames:
+                table[name] = table[name] * unit
+    return table
+
+
+def _with_sky(table, image):
+    if image.wcs is None:
+        return table
+    from photutils_mgauss.sky_photometry import add_sky_positions
+    return add_sky_positions(table, image.wcs)
+
+
+def exposure(image, name):
+    """Return where and when: what motions needs of an image."""
+    time = image.time
+    folder = name.resolve().parent
+    return {'image': os.path.relpath(image.path.resolve(), folder),
+            'time': None if time is None else _jyear(time)}
+
+
+def _jyear(time):
+    from photutils_mgauss._parallax import julian_years
+    return float(julian_years(time))

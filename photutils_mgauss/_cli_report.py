@@ -1,0 +1,80 @@
+"""``mgauss report``: results to figures and one page of HTML."""
+from importlib.util import find_spec
+from pathlib import Path
+
+from photutils_mgauss import _cli_tools as tools
+
+
+def add(commands):
+    """Add the command to the parser's."""
+    parser = tools.command(
+        commands, 'report', 'figures and a page of HTML of results',
+        'Show PSFs, catalogues and proper motions on one page of HTML, which '
+        'has its figures\ninside and needs no other file.',
+        'mgauss report night1_psf.fits night1_cat.ecsv mgauss_motions '
+        '--output report.html', run)
+    parser.add_argument('inputs', nargs='+', metavar='PATH',
+                        help='results of other commands, or folders of them')
+    parser.add_argument('--output', default='mgauss_report.html',
+                        metavar='FILE', help='default: %(default)s')
+    parser.add_argument('--title', default='Positions and proper motions',
+                        help='of the page (default: %(default)s)')
+    tools.add_manners(parser)
+
+
+def run(options):
+    """Write the page."""
+    output = Path(options.output)
+    if output.suffix not in ('.html', '.htm'):
+        msg = f'{output}: --output must end with .html'
+        raise ValueError(msg)
+    paths = _files(options.inputs)
+    tools.claim([output], options.overwrite)
+    _check_matplotlib()
+    with tools.Progress(len(paths) + 1, options.quiet) as step:
+        sections = [_section(path, named, step) for path, named in paths]
+        sections = [section for section in sections if section is not None]
+        if not sections:
+            msg = f'{options.inputs[0]}: must hold results, got none'
+            raise ValueError(msg)
+        step('draw figures')
+        _write(options, sections, output)
+    tools.say(options, f'{output}: {len(sections)} results')
+
+
+def _write(options, sections, output):
+    from photutils_mgauss._report_page import html_page
+    page = html_page(options.title, sections, tools.record_of(options))
+    with tools.whole_file(output) as draft:
+        draft.write_text(page, encoding='utf-8')
+
+
+def _files(inputs):
+    """Return (path, whether it was named itself) of all files."""
+    found = []
+    for path in map(Path, inputs):
+        if path.is_dir():
+            found += [(file, False) for file in sorted(path.iterdir())
+                      if file.is_file() and not file.name.startswith('.')]
+        else:
+            tools.check_inputs([path])
+            found.append((path, True))
+    return found
+
+
+def _section(path, named, step):
+    from photutils_mgauss._report_sections import section_of
+    step(f'read {path}')
+    section = section_of(path)
+    if section is None and named:
+        msg = (f'{path}: must be a PSF, a catalogue, proper motions, an '
+               'alignment or residuals')
+        raise ValueError(msg)
+    return section
+
+
+def _check_matplotlib():
+    if find_spec('matplotlib') is None:
+        msg = ('matplotlib must be installed for reports: '
+               "pip install 'photutils_mgauss[plot]'")
+        raise ValueError(msg)

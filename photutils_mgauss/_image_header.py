@@ -1,0 +1,189 @@
+"""What the header of an image says of its unit, its noise and its time."""
+import re
+
+import astropy.units as u
+import numpy as np
+from astropy.io.fits.card import Undefined
+from astropy.time import Time
+
+_GAIN = ('GAIN', 'EGAIN', 'ATODGAIN', 'CCDGAIN')
+_READ_NOISE = ('RDNOISE', 'READNOIS', 'RON', 'READNSEA')
+_EXPOSURE_TIME = ('EXPTIME', 'XPOSURE', 'EFFEXPTM', 'TEXPTIME', 'EXPOSURE')
+_SATURATION = ('SATURATE', 'SATLEVEL', 'SATURAT')
+
+# Spellings of what detectors count, and of "each second".
+_COUNTED = {'e': u.electron, 'e-': u.electron, 'electron': u.electron,
+            'electrons': u.electron, 'adu': u.adu, 'dn': u.DN,
+            'count': u.count, 'counts': u.count}
+_RATE = re.compile(r'(.+?)(?:/s(?:ec)?|\*?\*?s(?:\^|\*\*)?-1)')
+
+
+class Cards:
+    """
+    The headers that hold for an image, the most special one first.
+
+    Parameters
+    ----------
+    *headers : mapping
+        Of keywords and values.
+    """
+
+    def __init__(self, *headers):
+        self._headers = headers
+
+    def get(self, *keys):
+        """Return the first value there is for any of the keys, or None."""
+        for key in keys:
+            for header in self._headers:
+                value = header.get(key)
+                if value not in (None, '') and not isinstance(value,
+                                                              Undefined):
+                    return value
+        return None
+
+    def number(self, *keys):
+        """Return the first finite number there is, or None."""
+        for key in keys:
+            value = self.get(key)
+            if (isinstance(value, (int, float, np.number))
+                    and not isinstance(value, bool) and np.isfinite(value)):
+                return float(value)
+        return None
+
+    @property
+    def gain(self):
+        """Electrons in a count."""
+        return self.positive(*_GAIN)
+
+    @property
+    def read_noise(self):
+        """The noise of the readout [electron]."""
+        return self.positive(*_READ_NOISE)
+
+    @property
+    def exposure_time(self):
+        """The exposure time [s]."""
+        return self.positive(*_EXPOSURE_TIME)
+
+    @property
+    def saturation(self):
+        """The level from which pixels are saturated, in the image's unit."""
+        return self.positive(*_SATURATION)
+
+    def positive(self, *keys):
+        """Return the first number if it is positive, else None."""
+        value = self.number(*keys)
+        return value if value is not None and value > 0 else None
+
+    @property
+    def unit(self):
+        """The unit of the image, or None."""
+        text = self.get('BUNIT')
+        return None if text is None else parse_unit(str(text))
+
+    @property
+    def removed_sky(self):
+        """
+        The level of a sky that is known and no longer in the image.
+
+        MDRIZSKY is only a note in HST's single exposures, and what was taken
+        away from drizzled images.
+        """
+        drizzled = self.get('NDRIZIM') is not None or self.get(
+            'DRIZCORR') == 'COMPLETE'
+        return (self.positive('MDRIZSKY') or 0.0) if drizzled else 0.0
+
+    @property
+    def telescope(self):
+        """The name of the telescope, upper case."""
+        return str(self.get('TELESCOP') or '').strip().upper()
+
+    @property
+    def time(self):
+        """The middle of the exposure, a `~astropy.time.Time`, or None."""
+        scale = str(self.get('TIMESYS') or 'utc').strip().lower()
+        scale = scale if scale in Time.SCALES else 'utc'
+        for find in (_middle, _middle_of_limits, _start_and_length):
+            time = find(self, scale)
+            if time is not None:
+                return time
+        return None
+
+
+def parse_unit(text):
+    """Return the unit a header's word stands for, or None."""
+    word = text.strip().lower().replace(' ', '')
+    rate = _RATE.fullmatch(word)
+    counted = _COUNTED.get(rate.group(1) if rate else word)
+    if counted is not None:
+        return counted / u.s if rate else counted
+    unit = u.Unit(text.strip(), parse_strict='silent')
+    return None if isinstance(unit, u.UnrecognizedUnit) else unit
+
+
+def electrons_in_unit(unit, gain, exposure_time):
+    """
+    Return the electrons in one unit of an image, None if that is unknown.
+
+    Parameters
+    ----------
+    unit : `~astropy.units.UnitBase` or None
+        An image without unit is taken to hold counts.
+    gain : float or None
+        Electrons in a count.
+    exposure_time : float or None
+        In seconds.
+    """
+    unit = u.adu if unit is None else unit
+    for counted in set(_COUNTED.values()):
+        each = 1.0 if counted is u.electron else gain
+        if unit == counted:
+            return each
+        if unit == counted / u.s:
+            return each and exposure_time and each * exposure_time
+    return None
+
+
+def _middle(cards, scale):
+    mjd = cards.number('MJD-AVG', 'EXPMID', 'MJD-MID')
+    if mjd is not None:
+        return Time(mjd, format='mjd', scale=scale)
+    return _date(cards.get('DATE-AVG', 'DATE-MID'), scale)
+
+
+def _middle_of_limits(cards, scale):
+    for first, last in (('EXPSTART', 'EXPEND'), ('MJD-BEG', 'MJD-END')):
+        start, end = cards.number(first), cards.number(last)
+        if start is not None and end is not None:
+            return Time((start + end) / 2, format='mjd', scale=scale)
+    start, end = (_date(cards.get(key), scale)
+                  for key in ('DATE-BEG', 'DATE-END'))
+    if start is None or end is None:
+        return None
+    return start + (end - start) / 2
+
+
+def _start_and_length(cards, scale):
+    mjd = cards.number('EXPSTART', 'MJD-BEG', 'MJD-OBS')
+    start = (Time(mjd, format='mjd', scale=scale) if mjd is not None
+             else _date(_date_text(cards), scale))
+    if start is None:
+        return None
+    return start + (cards.exposure_time or 0.0) / 2 * u.s
+
+
+def _date_text(cards):
+    date = cards.get('DATE-BEG', 'DATE-OBS')
+    time = cards.get('TIME-OBS', 'UTC-OBS', 'UTSTART')
+    if date is None or 'T' in str(date) or time is None:
+        return date
+    return f'{date}T{time}'
+
+
+def _date(text, scale):
+    if text is None:
+        return None
+    try:
+        return Time(str(text).strip(), scale=scale)
+    except ValueError:
+        return None

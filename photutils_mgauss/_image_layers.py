@@ -1,0 +1,424 @@
+"""
+Image files to arrays: values, errors, flags, and the WCS they carry.
+
+FITS with one or several extensions, the SCI, ERR and DQ of JWST and HST, the
+ASDF of Roman, and files beside an image as CSST has them.
+"""
+import warnings
+from collections.abc import Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from astropy.nddata.bitmask import bitfield_to_boolean_mask
+from astropy.time import Time
+from astropy.wcs import WCS
+
+from photutils_mgauss._image_header import Cards
+
+# Names of extensions with the noise, and what is in them.
+_NOISE = {'ERR': 'error', 'ERROR': 'error', 'UNCERT': 'error',
+          'STDDEV': 'error', 'SIGMA': 'error', 'RMS': 'error',
+          'VAR': 'variance', 'VARIANCE': 'variance',
+          'IVAR': 'weight', 'INVVAR': 'weight', 'WEIGHT': 'weight'}
+_FLAGS = ('DQ', 'FLAG', 'FLAGS', 'MASK')
+
+# Endings of the names of files beside an image, and what is in them.
+_BESIDE = {'err': 'error', 'rms': 'error', 'sigma': 'error',
+           'var': 'variance', 'wht': 'weight', 'weight': 'weight',
+           'ivar': 'weight', 'flg': 'flags', 'flag': 'flags',
+           'flags': 'flags', 'dq': 'flags', 'mask': 'flags'}
+_OWN_ENDINGS = ('_img', '_sci', '-img', '-sci')
+
+# Bits that do not make a pixel bad, as astropy.nddata.bitmask takes them. Of
+# JWST and Roman only the first bit means "do not use"; HST marks what it
+# has corrected: 32 and 64 (charge transfer, warm), 1024 (sink pixels).
+_HARMLESS = {'JWST': '~1', 'ROMAN': '~1', 'HST': 32 + 64 + 1024}
+
+_NOISE_OF = {'error': np.asarray, 'variance': np.sqrt,
+             'weight': lambda weight: 1 / np.sqrt(weight)}
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """
+    What the files of an image hold, as arrays of one shape.
+
+    ``error`` and ``flags`` may be None, ``wcs`` too; ``sources`` names where
+    each of them was found.
+    """
+
+    data: np.ndarray
+    error: np.ndarray | None
+    flags: np.ndarray | None
+    covered: np.ndarray | None
+    cards: Cards
+    wcs: object
+    sources: dict
+
+    def mask(self, good_bits):
+        """Return True where a pixel must not be used."""
+        bad = ~np.isfinite(self.data)
+        if self.flags is not None:
+            flags = self.flags
+            if flags.dtype.kind not in 'iu':
+                flags = np.nan_to_num(flags, nan=1).astype(np.int64)
+            if good_bits is None:
+                good_bits = _HARMLESS.get(self.cards.telescope, 0)
+            bad |= bitfield_to_boolean_mask(flags, ignore_flags=good_bits,
+                                            good_mask_value=False,
+                                            dtype=bool)
+        if self.error is not None:
+            with np.errstate(invalid='ignore'):
+                bad |= ~(np.isfinite(self.error) & (self.error > 0))
+        if self.covered is not None:
+            bad |= ~self.covered
+        return bad
+
+
+def read_layers(path, *, ext=None, beside=None):
+    """
+    Read an image and what belongs to it.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A FITS or ASDF file.
+    ext : str, optional
+        The extension with the image: a number, a name, or 'name,version'.
+    beside : dict, optional
+        Files with 'error', 'weight' (inverse variance) or 'flags'. What
+        neither they nor the image's own file hold is looked for in files
+        whose names differ by their endings, such as ``_wht`` and ``_flg``.
+
+    Returns
+    -------
+    Layers
+
+    Raises
+    ------
+    OSError, ValueError
+        If a file cannot be read or has no such image.
+    """
+    path = Path(path)
+    layers = (_read_asdf(path) if is_asdf(path) else _read_fits(path, ext))
+    given = {kind: Path(file) for kind, file in (beside or {}).items()
+             if file}
+    return _with_companions(path, layers, given)
+
+
+def is_asdf(path):
+    """Whether a file says that it is an ASDF file."""
+    with Path(path).open('rb') as file:
+        return file.read(5) == b'#ASDF'
+
+
+@contextmanager
+def open_fits(path):
+    """Open a FITS file; what is wrong with it becomes one kind of error."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('always')
+        try:
+            hdus = fits.open(path, memmap=False, ignore_missing_end=True)
+        except OSError as error:
+            if isinstance(error, (FileNotFoundError, IsADirectoryError,
+                                  PermissionError)):
+                raise
+            raise _damaged(path, error) from error
+        with hdus:
+            len(hdus)  # reads all headers
+            # Of a truncated file astropy only warns.
+            for warning in caught:
+                if 'truncated' in str(warning.message):
+                    raise _damaged(path, warning.message)
+            yield hdus
+
+
+def _damaged(path, error):
+    return ValueError(f'{path}: must be an undamaged FITS or ASDF image, '
+                      f'got: {error}')
+
+
+def _read_fits(path, ext):
+    with open_fits(path) as hdus:
+        hdu = _science(path, hdus, ext)
+        data = _plane(path, hdu)
+        sources = {'image': _name(hdus, hdu)}
+        error = _first(path, hdus, hdu, _NOISE, sources, 'error')
+        if error is not None:
+            kind = _NOISE[sources['error'].split(',')[0]]
+            error = to_error(error, kind)
+        flags = _first(path, hdus, hdu, _FLAGS, sources, 'flags')
+        weight = _first(path, hdus, hdu, ('WHT',), {}, 'weight')
+        covered = None if weight is None else weight > 0
+        cards = Cards(hdu.header, hdus[0].header)
+        wcs = _fits_wcs(hdus, hdu)
+    layers = Layers(data, error, flags, covered, cards, wcs, sources)
+    for name in ('error', 'flags', 'covered'):
+        _check_shape(path, getattr(layers, name), layers, name)
+    return layers
+
+
+def _science(path, hdus, ext):
+    images = [hdu for hdu in hdus if _is_image(hdu)]
+    if ext is not None:
+        return _chosen(path, hdus, images, ext)
+    science = [hdu for hdu in images if hdu.name in ('SCI', 'SCIENCE')]
+    others = [hdu for hdu in images if hdu.name not in
+              (*_NOISE, *_FLAGS, 'WHT', 'CTX', 'CON')]
+    found = science or others
+    if len(found) == 1:
+        return found[0]
+    if not found:
+        msg = f'{path}: must hold an image of 2 dimensions, got none'
+        raise ValueError(msg)
+    names = ', '.join(_name(hdus, hdu) for hdu in found)
+    msg = (f'{path}: --ext must say which image to take, for there are '
+           f'{len(found)}: {names}')
+    raise ValueError(msg)
+
+
+def _is_image(hdu):
+    return hdu.is_image and hdu.header.get('NAXIS') == 2
+
+
+def _chosen(path, hdus, images, ext):
+    name, _, version = str(ext).partition(',')
+    key = int(name) if name.isdigit() else (
+        (name, int(version)) if version.isdigit() else name)
+    try:
+        hdu = hdus[key]
+    except (KeyError, IndexError):
+        hdu = None
+    if hdu is None or not any(hdu is image for image in images):
+        names = ', '.join(_name(hdus, image) for image in images)
+        msg = (f'{path}: --ext must name an image of 2 dimensions '
+               f'({names or "there is none"}), got {ext}')
+        raise ValueError(msg)
+    return hdu
+
+
+def _name(hdus, hdu):
+    """Return what to call an extension in --ext."""
+    if not hdu.name or hdu.name == 'PRIMARY':
+        return str(hdus.index(hdu))
+    several = sum(other.name == hdu.name for other in hdus) > 1
+    return f'{hdu.name},{hdu.ver}' if several else hdu.name
+
+
+def _plane(path, hdu):
+    try:
+        data = hdu.data
+    except (OSError, ValueError, TypeError, Warning) as error:
+        raise _damaged(path, error) from error
+    if data is None or data.ndim != 2 or data.dtype.kind not in 'iuf':
+        msg = f'{path}: must hold an image of 2 dimensions, got {data!r:.80}'
+        raise ValueError(msg)
+    return np.array(data, dtype=float)
+
+
+def _first(path, hdus, science, names, sources, what):
+    """Return the first extension of these names beside the science one."""
+    for hdu in hdus:
+        if (hdu.name in names and hdu.ver == science.ver
+                and hdu is not science and _is_image(hdu)):
+            sources[what] = _name(hdus, hdu)
+            if what == 'flags':
+                return np.array(hdu.data)
+            return _plane(path, hdu)
+    return None
+
+
+def to_error(values, kind):
+    """Return standard deviations from 'error', 'variance' or 'weight'."""
+    with np.errstate(all='ignore'):
+        return _NOISE_OF[kind](np.asarray(values, float))
+
+
+def _check_shape(path, array, layers, what):
+    if array is not None and array.shape != layers.data.shape:
+        msg = (f'{path}: {what} must have the shape of the image, '
+               f'{layers.data.shape}, got {array.shape}')
+        raise ValueError(msg)
+
+
+def _fits_wcs(hdus, hdu):
+    wcs = _gwcs_inside(hdus)
+    if wcs is not None:
+        return wcs
+    # The lists of HDUs have the tables of distortions.
+    wcs = WCS(hdu.header, hdus)
+    if not wcs.has_celestial:
+        return None
+    return wcs if wcs.naxis == 2 else wcs.celestial
+
+
+def _gwcs_inside(hdus):
+    """Return the gwcs of an ASDF extension, as JWST's files have it."""
+    for hdu in hdus:
+        if hdu.name == 'ASDF':
+            tree = _asdf_tree(BytesIO(hdu.data.tobytes()))
+            return find_gwcs(tree)
+    return None
+
+
+def _asdf_tree(file):
+    """Return the whole tree of an ASDF file; unknown tags stay plain."""
+    import asdf
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        with asdf.open(file, lazy_load=False, memmap=False) as opened:
+            return opened.tree
+
+
+def find_gwcs(tree):
+    """Return the first gwcs in a tree of mappings, or None."""
+    from gwcs import WCS as GWCS
+    for value in tree.values():
+        found = (value if isinstance(value, GWCS)
+                 else find_gwcs(value) if isinstance(value, Mapping)
+                 else None)
+        if found is not None:
+            return found
+    return None
+
+
+def read_wcs(path):
+    """
+    Read the WCS of a file: a gwcs in ASDF, or a FITS header.
+
+    Raises
+    ------
+    OSError, ValueError
+        If there is none.
+    """
+    path = Path(path)
+    if is_asdf(path):
+        wcs = find_gwcs(read_asdf_tree(path))
+    else:
+        with open_fits(path) as hdus:
+            found = [_fits_wcs(hdus, hdu) for hdu in hdus if hdu.is_image]
+        wcs = next((one for one in found if one is not None), None)
+    if wcs is None:
+        msg = f'{path}: must hold a WCS with celestial axes, got none'
+        raise ValueError(msg)
+    return wcs
+
+
+def read_asdf_tree(path):
+    """Return the tree of an ASDF file; damage becomes a ValueError."""
+    try:
+        return _asdf_tree(path)
+    except OSError:
+        raise
+    except Exception as error:
+        # Whatever YAML, blocks and schemas can go wrong with.
+        raise _damaged(path, error) from error
+
+
+def _read_asdf(path):
+    """Read a file like Roman's: data, err and dq side by side."""
+    tree = read_asdf_tree(path)
+    branch = _branch_with_data(tree)
+    if branch is None:
+        msg = f"{path}: must hold an array of 2 dimensions called 'data'"
+        raise ValueError(msg)
+    sources = {'image': 'data'}
+    data, error, flags = (branch.get(name) for name in ('data', 'err', 'dq'))
+    for name, value in (('error', error), ('flags', flags)):
+        if value is not None:
+            sources[name] = {'error': 'err', 'flags': 'dq'}[name]
+    meta = branch.get('meta', {})
+    layers = Layers(_values(data), None if error is None else _values(error),
+                    None if flags is None else np.asarray(flags), None,
+                    Cards(_roman_cards(data, meta)), find_gwcs(branch),
+                    sources)
+    for name in ('error', 'flags'):
+        _check_shape(path, getattr(layers, name), layers, name)
+    return layers
+
+
+def _branch_with_data(tree):
+    if np.ndim(getattr(tree.get('data'), 'value', tree.get('data'))) == 2:
+        return tree
+    for value in tree.values():
+        found = (_branch_with_data(value) if isinstance(value, Mapping)
+                 else None)
+        if found is not None:
+            return found
+    return None
+
+
+def _values(data):
+    return np.array(getattr(data, 'value', data), dtype=float)
+
+
+def _roman_cards(data, meta):
+    """Return the keywords that the metadata of Roman stand for."""
+    exposure = meta.get('exposure', {})
+    cards = {'TELESCOP': meta.get('telescope'),
+             'EXPTIME': exposure.get('exposure_time'),
+             'DATE-AVG': _isot(exposure.get('mid_time')),
+             'DATE-BEG': _isot(exposure.get('start_time')),
+             'DATE-END': _isot(exposure.get('end_time'))}
+    unit = getattr(data, 'unit', None) or meta.get('bunit')
+    if unit is None and str(cards['TELESCOP']).upper() == 'ROMAN':
+        unit = 'DN / s'
+    cards['BUNIT'] = None if unit is None else str(unit)
+    return cards
+
+
+def _isot(time):
+    return time.utc.isot if isinstance(time, Time) else time
+
+
+def _with_companions(path, layers, given):
+    """Add errors and flags from files of their own."""
+    have = {'error' if layers.error is not None else None,
+            'flags' if layers.flags is not None else None}
+    found = dict(given)
+    for kind, file in _companions(path).items():
+        role = 'flags' if kind == 'flags' else 'error'
+        taken = {_role(other) for other in found}
+        if role not in have and role not in taken:
+            found[kind] = file
+    for kind, file in found.items():
+        layers = _add_companion(layers, kind, file)
+    return layers
+
+
+def _role(kind):
+    return 'flags' if kind == 'flags' else 'error'
+
+
+def _companions(path):
+    """Return the files beside an image that say by name what they are."""
+    stem, suffix = path.name, ''.join(path.suffixes[-2:])
+    suffix = suffix if suffix.endswith(('.gz', '.fz')) else path.suffix
+    stem = stem.removesuffix(suffix)
+    for own in _OWN_ENDINGS:
+        stem = stem.removesuffix(own)
+    found = {}
+    for ending, kind in _BESIDE.items():
+        file = path.with_name(f'{stem}_{ending}{suffix}')
+        if kind not in found and file != path and file.exists():
+            found[kind] = file
+    return found
+
+
+def _add_companion(layers, kind, file):
+    with open_fits(file) as hdus:
+        images = [hdu for hdu in hdus if _is_image(hdu)]
+        if len(images) != 1:
+            msg = f'{file}: must hold one image, got {len(images)}'
+            raise ValueError(msg)
+        values = (np.array(images[0].data) if kind == 'flags'
+                  else _plane(file, images[0]))
+    _check_shape(file, values, layers, kind)
+    sources = {**layers.sources, _role(kind): file.name}
+    if kind == 'flags':
+        return replace(layers, flags=values, sources=sources)
+    return replace(layers, error=to_error(values, kind), sources=sources)

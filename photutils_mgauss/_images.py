@@ -1,0 +1,220 @@
+"""
+Images of stars from files, ready to be measured.
+
+An image needs the noise of its pixels. Where its file does not have it, it
+follows from sky, readout and gain (Eq. 10 of Nie et al.).
+"""
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from photutils.background import Background2D
+from photutils.utils import calc_total_error
+
+from photutils_mgauss._image_header import electrons_in_unit
+from photutils_mgauss._image_layers import read_layers, read_wcs
+from photutils_mgauss._parallax import julian_years
+from photutils_mgauss.noise import background_error, pixel_error
+
+# The sky is not measured in boxes with a larger share of bad pixels [%].
+_BAD_SHARE = 50.0
+
+
+@dataclass(frozen=True)
+class Reading:
+    """
+    How an image is to be read; what is None is left to its files.
+
+    ``ext`` is the extension, ``error``, ``weight``, ``flags`` and ``wcs``
+    are files beside the image. ``good_bits`` are the bits of the flags that
+    do not make a pixel bad, ``gain`` the electrons in a count (or in a unit
+    that is no count), ``read_noise`` in electrons, ``exposure_time`` in
+    seconds, ``saturation`` in the image's unit, ``time`` the middle of the
+    exposure, ``sky_box`` the side of the boxes of the sky in pixels.
+    """
+
+    ext: str | None = None
+    error: str | None = None
+    weight: str | None = None
+    flags: str | None = None
+    wcs: str | None = None
+    good_bits: int | None = None
+    gain: float | None = None
+    read_noise: float | None = None
+    exposure_time: float | None = None
+    saturation: float | None = None
+    time: object = None
+    sky_box: int = 128
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """
+    The noise of the pixels of an image, (ny, nx).
+
+    ``total`` is that of an image with its stars. If ``gain``, electrons per
+    unit, is not None, ``background`` is the noise without the light of the
+    stars; otherwise it is the same as ``total``.
+    """
+
+    total: np.ndarray
+    background: np.ndarray
+    gain: float | None
+
+
+class StarImage:
+    """
+    An image of stars and all that its files say of it.
+
+    Parameters
+    ----------
+    path : `~pathlib.Path`
+        Its file.
+    layers : `~photutils_mgauss._image_layers.Layers`
+        The arrays.
+    reading : `Reading`
+        What the user says of them.
+    """
+
+    def __init__(self, path, layers, reading):
+        self.path = Path(path)
+        self.layers = layers
+        self._reading = reading
+        self.mask = layers.mask(reading.good_bits)
+        if self.mask.all():
+            msg = f'{path}: must have pixels that are not bad, got none'
+            raise ValueError(msg)
+
+    @property
+    def data(self):
+        """The values with the sky in them, (ny, nx)."""
+        return self.layers.data
+
+    @property
+    def unit(self):
+        """The unit of the values, or None."""
+        return self.layers.cards.unit
+
+    @cached_property
+    def wcs(self):
+        """The WCS, or None."""
+        if self._reading.wcs is not None:
+            return read_wcs(self._reading.wcs)
+        return self.layers.wcs
+
+    @property
+    def time(self):
+        """The middle of the exposure, or None."""
+        if self._reading.time is not None:
+            return self._reading.time
+        return self.layers.cards.time
+
+    @property
+    def saturation(self):
+        """The level of saturated pixels, or None."""
+        return self._or_header('saturation')
+
+    def _or_header(self, name):
+        own = getattr(self._reading, name)
+        return getattr(self.layers.cards, name) if own is None else own
+
+    @cached_property
+    def sky(self):
+        """The `~photutils.background.Background2D` of the image."""
+        ny, nx = self.data.shape
+        box = min(self._reading.sky_box, ny, nx)
+        try:
+            return Background2D(np.where(self.mask, 0, self.data), box,
+                                mask=self.mask, exclude_percentile=_BAD_SHARE)
+        except ValueError as error:
+            msg = (f'{self.path}: must have a box of {box} x {box} pixels '
+                   f'with {_BAD_SHARE:g} % good ones to measure the sky in; '
+                   'choose another --sky-box')
+            raise ValueError(msg) from error
+
+    @cached_property
+    def without_sky(self):
+        """The values less the sky, 0 at bad pixels, (ny, nx)."""
+        return np.where(self.mask, 0, self.data - self.sky.background)
+
+    @property
+    def electrons(self):
+        """The electrons in a unit of the image, or None."""
+        unit, gain = self.unit, self._reading.gain
+        if gain is None:
+            gain = self.layers.cards.gain
+        known = electrons_in_unit(unit, gain,
+                                  self._or_header('exposure_time'))
+        return self._reading.gain if known is None else known
+
+    @cached_property
+    def noise(self):
+        """The `Noise`, from the file or from sky, readout and gain."""
+        if self.layers.error is not None:
+            return Noise(self.layers.error, self.layers.error, None)
+        electrons = self.electrons
+        if electrons is None:
+            raise ValueError(self._no_noise())
+        level = self.sky.background + self.layers.cards.removed_sky
+        read_noise = self._or_header('read_noise')
+        light = self.without_sky
+        # A sky that is not positive was taken away by somebody before.
+        if read_noise is None or np.median(level) <= 0:
+            background = np.array(self.sky.background_rms)
+            total = calc_total_error(light, background, electrons)
+            return Noise(total, background, electrons)
+        known = {'sky': np.maximum(level, 0), 'read_noise': read_noise,
+                 'gain': electrons}
+        return Noise(pixel_error(light, **known), background_error(**known),
+                     electrons)
+
+    def _no_noise(self):
+        unit = 'no unit' if self.unit is None else f'the unit {self.unit}'
+        return (f'{self.path}: the noise must be known; it has neither an '
+                f'extension ERR nor a file beside it, and for an image with '
+                f'{unit} it takes --gain (electrons in a count or unit) and, '
+                f'for rates, --exposure-time')
+
+    def describe(self):
+        """Return a sentence on what was read."""
+        ny, nx = self.data.shape
+        places = [f'{what} {where}'
+                  for what, where in self.layers.sources.items()]
+        if self.layers.error is None:
+            places.append('error from sky and gain')
+        words = [f'{nx} x {ny} pixels', ', '.join(places),
+                 f'{self.mask.mean():.1%} bad']
+        words.append('no WCS' if self.wcs is None else
+                     f'{type(self.wcs).__module__.split(".")[0]} WCS')
+        words.append('no time' if self.time is None else
+                     f'{julian_years(self.time):.3f}')
+        return f'{self.path}: {"; ".join(words)}'
+
+
+def read_image(path, reading=None):
+    """
+    Read an image of stars.
+
+    Parameters
+    ----------
+    path : str or path-like
+        FITS with one or several extensions, those of JWST and HST, ASDF like
+        Roman's, and images with files for errors and flags beside them.
+    reading : `Reading`, optional
+        What the files do not say, or should not decide.
+
+    Returns
+    -------
+    StarImage
+
+    Raises
+    ------
+    OSError, ValueError
+        If a file cannot be read, or what it holds is no image.
+    """
+    reading = Reading() if reading is None else reading
+    beside = {kind: getattr(reading, kind)
+              for kind in ('error', 'weight', 'flags')}
+    layers = read_layers(path, ext=reading.ext, beside=beside)
+    return StarImage(path, layers, reading)

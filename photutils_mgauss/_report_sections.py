@@ -1,0 +1,231 @@
+"""What a report says of PSFs, catalogues and proper motions."""
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from photutils_mgauss import plotting
+from photutils_mgauss._psf_files import psf_kind, psf_record, read_psf
+from photutils_mgauss._report_page import Panel, Section
+from photutils_mgauss.shapes import adaptive_moments
+
+# Nodes that whiskers and maps show along each axis at most.
+_SHOWN = 12
+
+
+def psf_section(path):
+    """Return the section on a PSF file."""
+    psf, record = read_psf(path), psf_record(path)
+    middle = psf.grid_xypos.mean(axis=0)
+    shapes = adaptive_moments(psf.mixtures)
+    fwhm = 2.3548 * np.sqrt(np.atleast_1d(shapes.r2) / 2)
+    facts = {'Nodes': ' x '.join(str(n) for n in psf.grid_shape[::-1]),
+             'Gaussians at a node': psf.n_components,
+             'FWHM, median [pix]': f'{np.median(fwhm):.3f}',
+             'Ellipticity, median': f'{np.median(shapes.ellipticity):.3f}'}
+    for name, words in (('n_stars', 'Stars it was made of'),
+                        ('degree', 'Degree over the detector'),
+                        ('accuracy', 'Relative error left')):
+        if record.get(name):
+            value = record[name]
+            facts[words] = f'{value:.2g}' if name == 'accuracy' else value
+    panels = [Panel(lambda ax: plotting.plot_psf_image(ax, psf, *middle),
+                    'The PSF in the middle of the detector.')]
+    if len(psf.grid_xypos) > 1:
+        panels += _maps(psf)
+    return Section(f'PSF: {path}', facts=facts, panels=tuple(panels),
+                   record=record)
+
+
+def _maps(psf):
+    coarse = _thinned(psf)
+    panels = [
+        Panel(lambda ax: plotting.plot_width_map(ax, psf),
+              'The width of the PSF over the detector.'),
+        Panel(lambda ax: plotting.plot_whiskers(ax, coarse),
+              'The ellipticity of the PSF, as whiskers along its long '
+              'axis.')]
+    if np.isfinite(np.asarray(psf.report['size_error'], float)).any():
+        panels.append(Panel(
+            lambda ax: plotting.plot_node_map(ax, psf, 'size_error'),
+            'How much larger the images were than the mixtures fitted to '
+            'them.'))
+    return panels
+
+
+def _thinned(psf):
+    """Return a grid with no more nodes than whiskers can be told apart."""
+    axes = [np.unique(psf.grid_xypos[:, k]) for k in (0, 1)]
+    kept = [axis[::-(-axis.size // _SHOWN)] for axis in axes]
+    inside = [np.isin(psf.grid_xypos[:, k], kept[k]) for k in (0, 1)]
+    nodes = np.flatnonzero(inside[0] & inside[1])
+    mixtures = psf.mixtures
+    return type(psf)([mixtures[m] for m in nodes], psf.grid_xypos[nodes],
+                     pixel_integrated=psf.pixel_integrated)
+
+
+def catalogue_section(path, table, record):
+    """Return the section on a catalogue of one image."""
+    good = np.asarray(table['flags']) == 0 if 'flags' in table.colnames else (
+        np.ones(len(table), bool))
+    flux = _plain(table, 'flux_fit')
+    unit = getattr(table['flux_fit'], 'unit', None)
+    with np.errstate(invalid='ignore', divide='ignore'):
+        magnitude = -2.5 * np.log10(flux)
+    label = f'-2.5 log flux{"" if unit is None else f" / ({unit})"} [mag]'
+    errors = {name: _plain(table, name)[good] for name in ('x_err', 'y_err')}
+    bright = flux >= np.nanpercentile(flux[good], 90) if good.any() else good
+    facts = {'Stars': len(table), 'Without flags': int(good.sum()),
+             'Median error of x [pix]': f'{np.nanmedian(errors["x_err"]):.4f}',
+             'That of the brightest tenth [pix]':
+                 f'{np.nanmedian(_plain(table, "x_err")[bright & good]):.4f}'}
+    facts |= _when(record)
+    x, y = _plain(table, 'x_fit'), _plain(table, 'y_fit')
+    panels = [
+        Panel(lambda ax: plotting.plot_detections(ax, x, y, flux),
+              'The stars, brighter ones larger.'),
+        Panel(lambda ax: plotting.plot_stated_errors(
+            ax, magnitude[good], errors, unit='pix', label=label),
+            'Errors of position against magnitude, of stars without flags.')]
+    if 'reduced_chi2' in table.colnames:
+        chi2 = {'reduced chi2': _plain(table, 'reduced_chi2')[good]}
+        panels.append(Panel(
+            lambda ax: _chi2(ax, magnitude[good], chi2, label),
+            'How well the PSF describes the stars: 1 if noise is all that '
+            'is left.'))
+    return Section(f'Catalogue: {path}', facts=facts, panels=tuple(panels),
+                   record=record)
+
+
+def _chi2(ax, magnitude, chi2, label):
+    plotting.plot_stated_errors(ax, magnitude, chi2, unit='', label=label)
+    ax.set_ylabel('reduced chi2')
+    ax.axhline(1, color=plotting.BLACK, linewidth=0.8)
+
+
+def _plain(table, name):
+    column = table[name]
+    return np.ma.filled(np.ma.asarray(getattr(column, 'value', column),
+                                      dtype=float), np.nan)
+
+
+def _when(record):
+    time = record.get('exposure', {}).get('time')
+    return {} if time is None else {'Middle of the exposure [Julian year]':
+                                    f'{time:.4f}'}
+
+
+def motion_section(path, table, record):
+    """Return the section on a table of proper motions."""
+    solved = np.isfinite(_plain(table, 'pmra_error'))
+    unit = table['pmra'].unit
+    facts = {'Stars': len(table), 'With proper motions': int(solved.sum())}
+    # Files have no empty words, only missing ones.
+    table['reference'] = (np.ma.filled(table['reference'], '')
+                          if 'reference' in table.colnames else '')
+    free = np.asarray(table['reference']) == ''
+    facts['References'] = int(np.sum(~free))
+    for name in ('pmra', 'pmdec'):
+        values = _plain(table, f'{name}_error')[solved]
+        if values.size:
+            facts[f'Median error of {name} [{unit}]'] = (
+                f'{np.median(values):.3f}')
+    panels = _motion_panels(table, solved, free) if solved.any() else ()
+    return Section(f'Proper motions: {path}', facts=facts, panels=panels,
+                   text=' '.join(record.get('notes', [])), record=record)
+
+
+def _motion_panels(table, solved, free):
+    panels = [Panel(lambda ax: plotting.plot_proper_motions(
+        ax, table[solved]), 'The proper motions.')]
+    # The motions of references are what a catalogue says.
+    stars = table[solved & free]
+    with np.errstate(invalid='ignore', divide='ignore'):
+        magnitude = -2.5 * np.log10(_plain(stars, 'flux'))
+    errors = {name: _plain(stars, f'{name}_error')
+              for name in ('pmra', 'pmdec')}
+    if np.isfinite(magnitude).any():
+        panels.append(Panel(
+            lambda ax: plotting.plot_stated_errors(
+                ax, magnitude, errors, unit=str(table['pmra'].unit),
+                label='-2.5 log flux [mag]'),
+            'Errors of the motions of stars against magnitude.'))
+    return tuple(panels)
+
+
+def alignment_section(path, table, record):
+    """Return the section on how epochs were aligned."""
+    rows = []
+    for row in table:
+        line = {'Epoch': int(row['epoch']), 'Year':
+                f'{getattr(row["time"], "jyear", row["time"]):.3f}'}
+        for name in ('shift', 'shift_error', 'systematic'):
+            value = row[name]
+            line[f'{name} [{value.unit}]'] = ', '.join(
+                f'{one:.3g}' for one in np.ravel(value.value))
+        for name in table.colnames:
+            if name.startswith(('n_', 'rms')):
+                unit = getattr(row[name], 'unit', None)
+                words = name if unit is None else f'{name} [{unit}]'
+                line[words] = _number(row[name])
+        rows.append(line)
+    return Section(f'Alignment: {path}', rows=rows, record=record,
+                   text='What the frame of each exposure was shifted by, in '
+                        'the middle of the field, and how well it fits.')
+
+
+def _number(value):
+    values = np.ravel(getattr(value, 'value', value))
+    return ', '.join(str(one) if np.issubdtype(values.dtype, np.integer)
+                     else f'{one:.3g}' for one in values)
+
+
+def residual_section(path, table, record):
+    """Return the section on the residuals of all detections."""
+    rows = table[_judged(table)]
+    shown = SimpleNamespace(residuals=rows)
+    epochs, counts = np.unique(np.asarray(rows['epoch']), return_counts=True)
+    panels = [Panel(lambda ax, epoch=epoch: plotting.plot_residual_vectors(
+        ax, shown, epoch), f'Residuals of epoch {epoch}.')
+        for epoch in epochs[counts > 1].tolist()]
+    return Section(
+        f'Residuals: {path}', panels=tuple(panels), record=record,
+        facts={'Detections': len(table),
+               'That anything can be said of': len(rows)},
+        text='Detections less the straight motions of their stars; those '
+             'left out are orange. Two detections always lie on a line.')
+
+
+def _judged(table):
+    """Return which detections are not fitted exactly, as two of a star."""
+    length = np.hypot(_plain(table, 'dra'), _plain(table, 'ddec'))
+    error = np.hypot(_plain(table, 'dra_error'), _plain(table, 'ddec_error'))
+    with np.errstate(invalid='ignore'):
+        return np.isfinite(length) & (length > 1e-6 * error)
+
+
+# The columns that tell a table, and what is said of it.
+_TABLES = (({'pmra', 'pmra_error'}, motion_section),
+           ({'dra', 'ddec', 'epoch'}, residual_section),
+           ({'epoch', 'shift', 'matrix'}, alignment_section),
+           ({'x_fit', 'y_fit', 'flux_fit'}, catalogue_section))
+
+
+def section_of(path):
+    """Return the section on a result, or None for any other file."""
+    from photutils_mgauss._cli_tools import read_table
+    path = Path(path)
+    if path.suffix not in ('.ecsv', '.fits', '.asdf', '.psf'):
+        return None
+    if path.suffix != '.ecsv' and psf_kind(path) != 'image':
+        return psf_section(path)
+    if path.suffix in ('.asdf', '.psf'):
+        return None
+    try:
+        table, record = read_table(path)
+    except (OSError, ValueError):
+        return None
+    for columns, make in _TABLES:
+        if columns <= set(table.colnames):
+            return make(path, table, record)
+    return None
