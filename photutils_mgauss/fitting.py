@@ -376,9 +376,9 @@ def _fit_image(problem, spaces, image, weight, start):
     else:
         solution = run(stamp, problem, spaces,
                        shapes_of(start, problem, stamp.centre))
-    if problem.astrometric:
+    if problem.astrometric and solution.has_flux:
         solution = refine_astrometry(stamp, problem, spaces, solution)
-    if not solution.fluxes.sum() > 0:
+    if not solution.has_flux:
         return _failure(FitStatus.EMPTY, image)
     return _report(problem, stamp, image, narrow_first(solution),
                    spaces[problem.n_components])

@@ -104,3 +104,14 @@ def test_more_gaussians_than_the_pixels_allow_are_refused():
         fit_mixture(image, 5)
     statuses = {fit.status for fit in fit_mixture([image, image], 5)}
     assert statuses == {FitStatus.TOO_FEW_PIXELS}
+
+
+@pytest.mark.parametrize('signed', [False, True])
+@pytest.mark.parametrize('weighting', ['uniform', 'astrometric'])
+def test_images_of_noise_do_not_crash(rng, weighting, signed):
+    noise = rng.standard_normal((30, 15, 15))
+    fits = fit_mixture(noise, 3, oversampling=2, weighting=weighting,
+                       signed=signed)
+    for fit in fits:
+        assert (fit.mixture is not None) == fit.status.usable
+        assert np.isfinite(fit.chi2) == fit.status.usable
