@@ -185,19 +185,18 @@ def _wcs_of(options, i, record):
     given = tools.one_each(options.wcs, len(options.inputs), 'wcs')[i]
     if given is not None:
         return read_wcs(given)
-    image = record.get('exposure', {}).get('image')
-    if image is None:
+    exposure = record.get('exposure', {})
+    name = exposure.get('wcs') or exposure.get('image')
+    if name is None:
         return None
-    image = Path(options.inputs[i]).resolve().parent / image
-    if not image.exists():
-        tools.say(options, f'{options.inputs[i]}: its image {image} is not '
-                  'there; the places on the sky are used as they are')
+    file = Path(options.inputs[i]).resolve().parent / name
+    if not file.exists():
+        tools.say(options, f'{options.inputs[i]}: {file} is not there, which '
+                  'has its WCS; the places on the sky are used as they are')
         return None
-    used = record.get('options', {})
-    wcs = used.get('wcs')
-    if wcs and len(used.get('inputs', [])) == 1 and Path(wcs[0]).exists():
-        return read_wcs(wcs[0])
-    return read_image(image, Reading(ext=used.get('ext'))).wcs
+    if exposure.get('wcs'):
+        return read_wcs(file)
+    return read_image(file, Reading(ext=exposure.get('ext'))).wcs
 
 
 def _epoch(options, path, table, wcs, time):
