@@ -13,7 +13,8 @@ class Stars:
     """The stars of a tile, as parallel arrays."""
 
     COLUMNS = ('x', 'y', 'flux', 'x_init', 'y_init', 'flux_init',
-               'significance', 'round', 'number', 'seeded', 'rows', 'count')
+               'significance', 'round', 'number', 'seeded', 'rows', 'paces',
+               'count')
 
     def __init__(self, x, y, flux, *, significance=0, found_in=0, number=-1,
                  seeded=False, n_rows=0):
@@ -27,6 +28,7 @@ class Stars:
         self.seeded = np.zeros(n, bool) | seeded
         # The Gaussians of each star's PSF, filled in when it is drawn.
         self.rows = np.empty((n, n_rows, 6))
+        self.paces = np.empty((n, n_rows, 4))
         self.count = np.zeros(n, int)
 
     def __len__(self):

@@ -31,13 +31,20 @@ _BRIGHT_FLUX = 300
 # A star is drawn out to where its surface brightness falls below this
 # fraction of the noise.
 _WING_NOISE = 0.2
+# Of a star drawn afresh, Gaussians are left out where they fall below this
+# fraction of the noise.
+_FAINTEST = 1e-3
 # A step of Gauss-Newton moves a star no further than this [pix].
 _MAX_MOVE = 0.4
 # Nor does it change a flux by more than these factors.
 _LEAST_CHANGE, _MOST_CHANGE = 0.2, 2.5
-_CG_STEPS = 60
-# The PSF of a cell of this many pixels serves for finding.
-_CELL = 64
+# Joint equations are solved until the residual is this fraction of what it
+# was: what is left over would depend on what else is on the tile.
+_TOLERANCE = 1e-6
+_CG_STEPS = 400
+# The PSF of a cell of this many pixels of the image serves for finding; a
+# tile begins where a cell does.
+CELL = 32
 _TEMPLATE_HALF = 3
 # Pixels where nine together stand out less than this fraction of the
 # threshold are not looked at.
@@ -53,7 +60,6 @@ _GRAVE = 0.5
 # Finding starts with the brightest stars.
 _FALLING = (80, 25, 10)
 _FINAL_STEPS = 8
-_CONVERGED = 2e-4
 # Polishing moves no star further than this [pix]: blends that cannot be
 # resolved would run away.
 _ROAM = 0.5
@@ -82,6 +88,7 @@ class TileOptions:
     psf_error: float
     gain: float | None
     floor: float
+    noise: float
     max_rounds: int
 
 
@@ -118,11 +125,8 @@ class Tile:
         self.graves = np.empty((0, 2))
         self.weight = np.divide(1, self.variance, where=self.good,
                                 out=np.zeros(self.data.shape))
-        self.noise = 1 / np.sqrt(np.median(self.weight[self.good]))
-        ny, nx = self.data.shape
-        self.profile = self.psf.profile(nx / 2, ny / 2)
-        stamp = self.psf.stamp(nx / 2, ny / 2, MAX_WING)
-        self.area = stamp.sum()**2 / (stamp**2).sum()
+        self.noise = job.options.noise
+        self.profile, self.area = self.psf.profile, self.psf.area
         self.widths = np.empty(0)
         self._make_mesh()
         self._make_templates()
@@ -134,18 +138,32 @@ class Tile:
         self.mesh_x = _lattice(x_0, nx, size) - x_0
         self.mesh_y = _lattice(y_0, ny, size) - y_0
         self.ties = _ties(self.mesh_y.size, self.mesh_x.size)
-        start = 0.0
+        self.hats = [_hats(n, nodes) for n, nodes in
+                     ((ny, self.mesh_y), (nx, self.mesh_x))]
+        # A node is the mean of the sky over the pixels nearest to it, so that
+        # it depends on nothing further away.
+        self.own = [_owners(n, nodes) for n, nodes in
+                    ((ny, self.mesh_y), (nx, self.mesh_x))]
+        self.level = np.zeros(self.mesh_x.size * self.mesh_y.size)
         if self.options.background_size:
-            # Stars hide the sky.
-            start = np.percentile(self.data[self.good], 20)
-        self.level = np.full(self.mesh_x.size * self.mesh_y.size, start)
+            self.level = self._first_level()
+
+    def _first_level(self):
+        """Return a faint percentile around each node: stars hide the sky."""
+        out = np.empty((self.mesh_y.size, self.mesh_x.size))
+        for j, i in np.ndindex(out.shape):
+            part = np.ix_(self.own[0][:, j] > 0, self.own[1][:, i] > 0)
+            seen = self.data[part][self.good[part]]
+            out[j, i] = np.percentile(seen, 20) if seen.size else np.nan
+        known = np.isfinite(out)
+        return np.where(known, out, np.median(out[known])).ravel()
 
     def _make_templates(self):
         ny, nx = self.data.shape
-        rows, columns = range(0, ny, _CELL), range(0, nx, _CELL)
+        rows, columns = range(0, ny, CELL), range(0, nx, CELL)
         self.templates = np.array([[
-            self.psf.stamp((x + min(x + _CELL, nx)) // 2,
-                           (y + min(y + _CELL, ny)) // 2, _TEMPLATE_HALF)
+            self.psf.stamp((x + min(x + CELL, nx)) // 2,
+                           (y + min(y + CELL, ny)) // 2, _TEMPLATE_HALF)
             for x in columns] for y in rows])
 
     # The model.
@@ -178,35 +196,36 @@ class Tile:
         everyone = np.arange(len(self.stars))
         self._localise_psf()
         self._draw_stamps(everyone)
-        self.residual = self.data.copy()
-        self._add_background(-1.0)
+        self.residual = self.data - self.background()
         self._add_stars(everyone, -1.0)
         self._weigh()
 
     def redraw(self, changed, change):
         """Let a function change some stars, and the level; stay up to date."""
         self._add_stars(changed, 1.0)
-        self._add_background(1.0)
+        before = self.background()
         change()
         self._draw_stamps(changed)
-        self._add_background(-1.0)
+        self.residual += before - self.background()
         self._add_stars(changed, -1.0)
         self._weigh()
 
     def _draw_stamps(self, chosen):
         s = self.stars
         _kernels.star_stamps(chosen, s.x, s.y, *self._place(), s.rows,
-                             s.count, self.psf.integrated, self.jets)
+                             s.paces, s.count, self.psf.integrated, self.jets)
 
     def _add_stars(self, chosen, sign):
         s = self.stars
         _kernels.add_stars(chosen, sign, s.x, s.y, s.flux, *self._place(),
                            self.wing, self.jets, s.rows, s.count,
-                           self.psf.integrated, self.residual)
+                           self.psf.integrated, _FAINTEST * self.noise,
+                           self.residual)
 
-    def _add_background(self, sign):
-        _kernels.add_background(self.level, self.mesh_x, self.mesh_y, sign,
-                                self.residual)
+    def background(self):
+        """Return the image of the background."""
+        level = self.level.reshape(self.mesh_y.size, -1)
+        return self.hats[0] @ level @ self.hats[1].T
 
     def _weigh(self):
         if self.options.gain is not None:
@@ -221,41 +240,46 @@ class Tile:
         new = s.count == 0
         if new.any():
             s.rows[new], s.count[new] = self.psf.rows_at(s.x[new], s.y[new])
+            s.paces[new] = self.psf.paces(s.rows[new])
 
     def star_light(self):
         """Return the image of the stars alone."""
-        image = self.data - self.residual
-        _kernels.add_background(self.level, self.mesh_x, self.mesh_y, -1.0,
-                                image)
-        return image
+        return self.data - self.residual - self.background()
 
     # The joint fit.
 
     def form_equations(self):
         """Form the joint normal equations of stars and background."""
         s, p = self.stars, self.pairs
-        n, m = len(s), self.level.size
+        n = len(s)
         self.matrix = np.empty((n, 3, 3))
         self.gradient, self.reach = np.empty((n, 3)), np.empty((n, 3))
         self.blocks = np.empty((p.neighbour.size, 3, 3))
-        self.mesh_gradient = np.zeros(m)
         place = (*self._place(), self.jets)
         _kernels.own_equations(s.flux, *place, self.weight, self.residual,
                                self.matrix, self.gradient, self.reach)
         _kernels.pair_blocks(p.indptr, p.neighbour, p.twin, s.flux, *place,
                              self.weight, self.blocks)
-        information = np.zeros(m)
-        if self.options.background_size:
-            _kernels.background_equations(
-                self.residual, self.weight, self.level, self.mesh_x,
-                self.mesh_y, _BACKGROUND_CLIP, information,
-                self.mesh_gradient)
-        else:
-            self.reach[:] = 0
+        information, self.mesh_gradient = self._background_equations()
         # Nodes without pixels follow their neighbours.
-        tie = _TIE * max(np.median(information), 1e-6 / self.noise**2)
+        tie = _TIE * (self.options.background_size or 1)**2 / self.noise**2
         self.mesh = np.diag(information) + tie * self.ties
         self.mesh_gradient -= tie * self.ties @ self.level
+
+    def _background_equations(self):
+        """Return the information on each node, and gradients."""
+        if not self.options.background_size:
+            self.reach[:] = 0
+            return np.zeros((2, self.level.size))
+        # All pixels count for the information: stars are coupled through all
+        # of theirs. Those far from the model say nothing about the sky.
+        weight = np.where(self.weight * self.residual**2
+                          <= _BACKGROUND_CLIP**2, self.weight, 0)
+        sky = weight * (self.residual + self.background())
+        information, seen, total = (
+            (self.own[0].T @ image @ self.own[1]).ravel()
+            for image in (self.weight, weight, sky))
+        return information, total - seen * self.level
 
     def refresh(self):
         """Bring everything up to date with the stars."""
@@ -263,7 +287,7 @@ class Tile:
         self.draw()
         self.form_equations()
 
-    def _solve(self, tolerance, damping):
+    def _solve(self, damping):
         """Return the Gauss-Newton step of the stars and of the level."""
         s, p = self.stars, self.pairs
         step = np.empty((len(s), 3))
@@ -272,7 +296,7 @@ class Tile:
         _kernels.solve_joint(
             matrix, self.gradient, p.indptr, p.neighbour, self.blocks,
             *self._own_node(), self.reach, self.mesh, self.mesh_gradient,
-            tolerance, _CG_STEPS, step, level_step)
+            _TOLERANCE, _CG_STEPS, step, level_step)
         step[:, 1:] = np.clip(step[:, 1:], -_MAX_MOVE, _MAX_MOVE)
         step[:, 0] = np.clip(step[:, 0], (_LEAST_CHANGE - 1) * s.flux,
                              (_MOST_CHANGE - 1) * s.flux)
@@ -285,21 +309,19 @@ class Tile:
         s.y = s.y + step[:, 2]
         self.level = self.level + level_step
 
-    def step(self, tolerance, damping=0.0):
-        """Take one Gauss-Newton step; return how far each star moved."""
-        step, level_step = self._solve(tolerance, damping)
-        self._take(step, level_step)
+    def step(self, damping=0.0):
+        """Take one Gauss-Newton step."""
+        self._take(*self._solve(damping))
         self.refresh()
-        return np.abs(step[:, 1:]).max(axis=1, initial=0)
 
-    def polish(self, tolerance, damping):
+    def polish(self, damping):
         """
         Take a step without a new layout; return how far each star moved.
 
         Stamps stay where they are, so that steps converge; stars that are
         at rest stay as they are.
         """
-        step, level_step = self._solve(tolerance, damping)
+        step, level_step = self._solve(damping)
         moved = np.abs(step[:, 1:]).max(axis=1, initial=0)
         self._rein(step)
         restless = moved > _REST
@@ -381,14 +403,14 @@ class Tile:
         weight = np.divide(self.weight, 1 + self.weight * light**2)
         for j, i in np.ndindex(self.templates.shape[:2]):
             _kernels.score(
-                self.residual, weight, self.templates[j, i], i * _CELL,
-                min((i + 1) * _CELL, nx), j * _CELL, min((j + 1) * _CELL, ny),
+                self.residual, weight, self.templates[j, i], i * CELL,
+                min((i + 1) * CELL, nx), j * CELL, min((j + 1) * CELL, ny),
                 _HINT * threshold, significance, flux)
         s, p = self.stars, self.pairs
         _kernels.score_beside(
             s.x, s.y, s.flux, *self._place(), self.jets, self.matrix,
             self.gradient, p.indptr, p.neighbour, self.blocks, self.templates,
-            _CELL, self.weight, self.residual, light, _REACH, _LEAST,
+            CELL, self.weight, self.residual, light, _REACH, _LEAST,
             threshold, significance, flux)
         return significance, flux
 
@@ -470,7 +492,7 @@ class Tile:
         seen = (w > 0) & (stamp > 0.002 * stamp.max())
         if seen.sum() < 8:
             return None
-        ratio = (self.data[part] - self.level[0])[seen] / stamp[seen]
+        ratio = (self.data[part] - self.background()[part])[seen] / stamp[seen]
         flux = np.median(ratio)
         significance = flux * np.sqrt(info)
         if significance < 10 * self.options.threshold:
@@ -517,56 +539,74 @@ def _warm_up(tile):
     s.flux = np.where(unknown, peak / tile.profile[0], s.flux)
     tile.refresh()
     for damping in (1.0, 0.3, 0.1, 0.03):
-        tile.step(1e-2, damping)
+        tile.step(damping)
 
+
+# What is done does not depend on how many stars there are or move: what
+# happens around a star has to be the same on every tile it is on.
 
 def _find_all(tile):
     options = tile.options
     for number, threshold in enumerate(_FALLING):
-        if threshold > options.threshold and tile.find(threshold, number):
+        if threshold > options.threshold:
+            tile.find(threshold, number)
             tile.refresh()
-            tile.step(1e-2, 0.05)
+            tile.step(0.05)
             if number == 0:
                 # Later, errors of the PSF are hidden by false companions.
-                tile.step(1e-2, 0.05)
+                tile.step(0.05)
                 tile.widths = _size_differences(tile)
             tile.leave_out(1.0)
             tile.refresh()
     for number in range(options.max_rounds):
-        new = tile.find(options.threshold, len(_FALLING) + number)
-        if new:
-            tile.refresh()
-            tile.step(1e-2, 0.05)
-            tile.step(1e-2, 0.01)
+        tile.find(options.threshold, len(_FALLING) + number)
+        tile.refresh()
+        tile.step(0.05)
+        tile.step(0.05)
         if number > 1:
             gone = tile.leave_out(options.keep)
             tile.graves = np.concatenate([tile.graves, gone])
         else:
-            gone = tile.leave_out(0.7 * options.keep)
+            tile.leave_out(0.7 * options.keep)
         tile.refresh()
-        if new <= 0.005 * len(tile.stars):
-            break
 
 
 def _settle(tile):
     tile.stars.count[:] = 0
     tile.start_polishing()
     tile.moved = np.zeros(len(tile.stars))
-    for _ in range(_FINAL_STEPS if len(tile.stars) else 1):
-        tile.moved = tile.polish(1e-3, 0.02)
-        if not (tile.moved > _CONVERGED).sum() > 0.005 * len(tile.stars):
+    for _ in range(_FINAL_STEPS):
+        tile.moved = tile.polish(0.02)
+        if not (tile.moved > _REST).any():
             break
-    far = ((np.abs(tile.stars.x - tile.left - tile.width // 2) > 1.5)
-           | (np.abs(tile.stars.y - tile.bottom - tile.width // 2) > 1.5))
-    if far.any():
-        tile.refresh()
+    # Some may have moved out of the middle of their stamps.
+    tile.refresh()
 
 
 def _lattice(first, size, spacing):
     """Return the multiples of spacing that are nearest to a pixel."""
-    low = np.rint(first / spacing)
-    high = max(np.rint((first + size - 1) / spacing), low + 1)
+    low = np.floor(first / spacing + 0.5)
+    high = max(np.floor((first + size - 1) / spacing + 0.5), low + 1)
     return np.arange(low, high + 1) * float(spacing)
+
+
+def _hats(size, nodes):
+    """Return the share (size, n) of each node in each pixel of an axis."""
+    cell, passed = cells(np.arange(float(size)), nodes)
+    out = np.zeros((size, nodes.size))
+    pixel = np.arange(size)
+    out[pixel, cell] = 1 - passed
+    out[pixel, cell + 1] = passed
+    return out
+
+
+def _owners(size, nodes):
+    """Return a matrix (size, n) of which node is nearest to each pixel."""
+    middle = (nodes[1:] + nodes[:-1]) / 2
+    out = np.zeros((size, nodes.size))
+    pixel = np.arange(size)
+    out[pixel, np.searchsorted(middle, pixel, side='right')] = 1
+    return out
 
 
 def _ties(ny, nx):

@@ -2860,87 +2860,123 @@ def field_model(corners, basis, coefficients, sources, n_sources, sky, out):
 # edges of the image. Parameters are ordered flux, x, y.
 
 @_jit
-def _add_jet_row(peak, u0, dy, p, s, q, jets):
-    """Add a Gaussian's value and derivatives by the centre to jets (3, n)."""
-    n = jets.shape[1]
-    start = min(max(int(np.rint(-u0)), 0), n - 1)
-    u = u0 + start
-    exponent = p * u * u + q * dy * dy
-    if exponent > _LOG_NOTHING:
-        return
-    first = peak * exp(-0.5 * exponent)
-    fall = exp(-p)
-    rise = exp(-p * (u + 0.5))
-    slope_y = q * dy
-    g = first
-    r = rise
-    for i in range(start, n):
-        a = p * (u0 + i) * g
-        jets[0, i] += g
-        jets[1, i] += a
-        jets[2, i] += slope_y * g - s * a
-        g *= r
-        r *= fall
-        if abs(g) < _NOTHING:
-            break
-    if start == 0:
-        return
-    g = first
-    r = fall / rise
-    for i in range(start - 1, -1, -1):
-        g *= r
-        if abs(g) < _NOTHING:
-            break
-        r *= fall
-        a = p * (u0 + i) * g
-        jets[0, i] += g
-        jets[1, i] += a
-        jets[2, i] += slope_y * g - s * a
-
-
-@_jit
-def _add_integrated_jet_row(peak, dx, dy, p, s, q, jets):
-    for i in range(jets.shape[1]):
-        gx, gy = _gradient(dx + i, dy, p, s, q, True)
-        jets[0, i] += peak * _pixel_integral(dx + i, dy, p, s, q)
-        jets[1, i] -= peak * gx
-        jets[2, i] -= peak * gy
-
-
-@_jit
-def star_stamps(chosen, x, y, left, bottom, width, offset, rows, count,
+def star_stamps(chosen, x, y, left, bottom, width, offset, rows, paces, count,
                 integrated, jets):
     """
     Fill the stamps of the chosen stars.
 
-    Star i's PSF are the first count[i] rows of rows[i].
+    Star i's PSF are the first count[i] rows of rows[i]; paces is as of
+    `paces`.
     """
+    widest = 0
+    for i in chosen:
+        widest = max(widest, width[i])
+    walk = np.empty(4 * _LANES)
+    tile = np.empty(3 * _LANES * widest)
     for i in chosen:
         w = width[i]
-        jets[:, offset[i]:offset[i] + w * w] = 0
-        for k in range(count[i]):
-            a, mx, my, p, s, q = rows[i, k]
-            dx = left[i] - x[i] - mx
-            for j in range(w):
-                dy = bottom[i] + j - y[i] - my
-                first = offset[i] + j * w
-                row = jets[:, first:first + w]
-                if integrated:
-                    _add_integrated_jet_row(a, dx, dy, p, s, q, row)
-                else:
-                    _add_jet_row(a, dx - s * dy, dy, p, s, q, row)
+        for first in range(0, w, _LANES):
+            height = min(_LANES, w - first)
+            walk[:] = 0.0
+            tile[:3 * _LANES * w] = 0.0
+            for k in range(count[i]):
+                a, mx, my, p, s, q = rows[i, k]
+                _add_gaussian(a, left[i] - x[i] - mx,
+                              bottom[i] + first - y[i] - my, p, s, q,
+                              paces[i, k], 0.0, 0.0, integrated, height, w,
+                              walk, tile)
+            for j in range(height):
+                to = offset[i] + (first + j) * w
+                for k in range(w):
+                    at = 3 * _LANES * k + j
+                    jets[0, to + k] = tile[at]
+                    jets[1, to + k] = tile[at + _LANES]
+                    jets[2, to + k] = tile[at + 2 * _LANES]
+
+
+@_jit
+def _walk_rows(start, end, way, fall, first, g, r, image):
+    """Add g (n,) to rows start, start + way, ... end of image, r its fall."""
+    for j in range(start, end + way, way):
+        row = image[j]
+        for i in range(g.size):
+            row[first + i] += g[i]
+            g[i] *= r[i]
+            r[i] *= fall
+
+
+@_jit
+def _add_lanes(peak, cx, cy, p, s, q, reach, lanes, image):
+    """
+    Add a Gaussian, sampled at pixel centres, to a box of the image.
+
+    The box is that of the ellipse where the exponent is -reach / 2. Rows are
+    walked outward from the peak, all columns of the box at once; lanes is
+    (4, n), n at least the length of a row of the image.
+    """
+    ny, nx = image.shape
+    half_x, half_y = sqrt(reach * (1 / p + s * s / q)), sqrt(reach / q)
+    if p * abs(s) * half_x > 300:
+        _add_sampled(peak, cx, cy, p, s, q, reach, image)
+        return
+    first = max(0, int(ceil(cx - half_x)))
+    n = min(nx - 1, int(floor(cx + half_x))) + 1 - first
+    low = max(0, int(ceil(cy - half_y)))
+    high = min(ny - 1, int(floor(cy + half_y)))
+    if n <= 0 or low > high:
+        return
+    start = min(max(int(np.rint(cy)), low), high)
+    dy = start - cy
+    t = q + s * s * p
+    fall = exp(-t)
+    g, r, h, d = lanes[0, :n], lanes[1, :n], lanes[2, :n], lanes[3, :n]
+    for i in range(n):
+        u = first + i - cx - s * dy
+        g[i] = peak * _exp(-0.5 * (p * u * u + q * dy * dy))
+        slope = q * dy - p * s * u
+        steep = _exp(-abs(slope))
+        up = steep if slope > 0 else 1 / steep
+        r[i] = up
+        d[i] = 1 / up
+    half = exp(-0.5 * t)
+    for i in range(n):
+        r[i] *= half
+        d[i] *= half
+        h[i] = g[i] * d[i]
+        d[i] *= fall
+    _walk_rows(start, high, 1, fall, first, g, r, image)
+    _walk_rows(start - 1, low, -1, fall, first, h, d, image)
+
+
+@_jit
+def _add_wings(rows, flux, cx, cy, integrated, faintest, lanes, scratch,
+               image):
+    """Add a star, each Gaussian out to where it falls below faintest."""
+    if integrated:
+        _add_star(rows, flux, cx, cy, True, faintest, scratch, image)
+        return
+    for k in range(rows.shape[0]):
+        a, mx, my, p, s, q = rows[k]
+        peak = flux * a
+        ratio = abs(peak) / faintest
+        if ratio > 1:
+            _add_lanes(peak, cx + mx, cy + my, p, s, q, 2 * log(ratio), lanes,
+                       image)
 
 
 @_jit
 def add_stars(chosen, sign, x, y, flux, left, bottom, width, offset, wing,
-              jets, rows, count, integrated, image):
+              jets, rows, count, integrated, faintest, image):
     """
     Add sign times the chosen stars to the image.
 
     A star whose wing (half a width, integer) reaches over its stamp is drawn
-    afresh; others are copied from it.
+    afresh, each Gaussian out to where it falls below faintest; others are
+    copied from it.
     """
     ny, nx = image.shape
+    scratch = np.empty((3, _ERRORS.size))
+    lanes = np.empty((4, nx))
     for i in chosen:
         w = width[i]
         if wing[i] <= w // 2:
@@ -2957,8 +2993,9 @@ def add_stars(chosen, sign, x, y, flux, left, bottom, width, offset, wing,
         y_high = min(ny, bottom[i] + w + grow)
         if x_low >= x_high or y_low >= y_high:
             continue
-        render(rows[i, :count[i]], x[i] - x_low, y[i] - y_low,
-               sign * flux[i], integrated, image[y_low:y_high, x_low:x_high])
+        _add_wings(rows[i, :count[i]], sign * flux[i], x[i] - x_low,
+                   y[i] - y_low, integrated, faintest, lanes, scratch,
+                   image[y_low:y_high, x_low:x_high])
 
 
 @_jit
@@ -3027,8 +3064,7 @@ def pair_blocks(indptr, neighbour, twin, flux, left, bottom, width, offset,
             j = neighbour[pair]
             if j < i:
                 continue
-            block = blocks[pair]
-            block[:] = 0
+            b00 = b01 = b02 = b10 = b11 = b12 = b20 = b21 = b22 = 0.0
             x_low = max(0, left[i], left[j])
             x_high = min(nx, left[i] + width[i], left[j] + width[j])
             for row in range(max(0, bottom[i], bottom[j]),
@@ -3038,14 +3074,25 @@ def pair_blocks(indptr, neighbour, twin, flux, left, bottom, width, offset,
                 other = offset[j] + (row - bottom[j]) * width[j] - left[j]
                 for k in range(x_low, x_high):
                     v = weight[row, k]
-                    b0 = v * jets[0, other + k]
-                    b1 = v * jets[1, other + k]
-                    b2 = v * jets[2, other + k]
-                    for m in range(3):
-                        a = jets[m, first + k]
-                        block[m, 0] += a * b0
-                        block[m, 1] += a * b1
-                        block[m, 2] += a * b2
+                    e0 = v * jets[0, other + k]
+                    e1 = v * jets[1, other + k]
+                    e2 = v * jets[2, other + k]
+                    d0 = jets[0, first + k]
+                    d1 = jets[1, first + k]
+                    d2 = jets[2, first + k]
+                    b00 += d0 * e0
+                    b01 += d0 * e1
+                    b02 += d0 * e2
+                    b10 += d1 * e0
+                    b11 += d1 * e1
+                    b12 += d1 * e2
+                    b20 += d2 * e0
+                    b21 += d2 * e1
+                    b22 += d2 * e2
+            block = blocks[pair]
+            block[0, 0], block[0, 1], block[0, 2] = b00, b01, b02
+            block[1, 0], block[1, 1], block[1, 2] = b10, b11, b12
+            block[2, 0], block[2, 1], block[2, 2] = b20, b21, b22
             block[1:] *= flux[i]
             block[:, 1:] *= flux[j]
             for m in range(3):
@@ -3074,8 +3121,13 @@ def _invert_3x3(a, out):
 @_jit
 def _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node, share,
                  reach, mesh, out, mesh_out):
-    """Multiply by the joint normal matrix of stars and background."""
+    """
+    Multiply by the joint normal matrix of stars and background.
+
+    Returns the product of v and the outcome.
+    """
     mesh_out[:] = mesh @ mesh_v
+    product = 0.0
     for i in range(v.shape[0]):
         level = 0.0
         for c in range(4):
@@ -3094,23 +3146,49 @@ def _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node, share,
         for pair in range(indptr[i], indptr[i + 1]):
             b = blocks[pair]
             j = neighbour[pair]
-            v0, v1, v2 = v[j, 0], v[j, 1], v[j, 2]
-            o0 += b[0, 0] * v0 + b[0, 1] * v1 + b[0, 2] * v2
-            o1 += b[1, 0] * v0 + b[1, 1] * v1 + b[1, 2] * v2
-            o2 += b[2, 0] * v0 + b[2, 1] * v1 + b[2, 2] * v2
+            w0, w1, w2 = v[j, 0], v[j, 1], v[j, 2]
+            o0 += b[0, 0] * w0 + b[0, 1] * w1 + b[0, 2] * w2
+            o1 += b[1, 0] * w0 + b[1, 1] * w1 + b[1, 2] * w2
+            o2 += b[2, 0] * w0 + b[2, 1] * w1 + b[2, 2] * w2
         out[i, 0] = o0
         out[i, 1] = o1
         out[i, 2] = o2
+        product += v0 * o0 + v1 * o1 + v2 * o2
+    for m in range(mesh_v.size):
+        product += mesh_v[m] * mesh_out[m]
+    return product
 
 
 @_jit
 def _precondition(inverse, mesh, r, mesh_r, z, mesh_z):
+    """Put r times the inverse blocks into z; return the product of both."""
+    product = 0.0
     for i in range(r.shape[0]):
-        for m in range(3):
-            z[i, m] = (inverse[i, m, 0] * r[i, 0] + inverse[i, m, 1] * r[i, 1]
-                       + inverse[i, m, 2] * r[i, 2])
+        c = inverse[i]
+        r0, r1, r2 = r[i, 0], r[i, 1], r[i, 2]
+        z0 = c[0, 0] * r0 + c[0, 1] * r1 + c[0, 2] * r2
+        z1 = c[1, 0] * r0 + c[1, 1] * r1 + c[1, 2] * r2
+        z2 = c[2, 0] * r0 + c[2, 1] * r1 + c[2, 2] * r2
+        z[i, 0], z[i, 1], z[i, 2] = z0, z1, z2
+        product += r0 * z0 + r1 * z1 + r2 * z2
     for m in range(mesh_r.size):
         mesh_z[m] = mesh_r[m] / mesh[m, m]
+        product += mesh_r[m] * mesh_z[m]
+    return product
+
+
+@_jit
+def _add_scaled(x, scale, y):
+    """Add scale * y to x, both flat."""
+    for i in range(x.size):
+        x[i] += scale * y[i]
+
+
+@_jit
+def _extend(x, scale, y):
+    """Put y + scale * x into x, both flat."""
+    for i in range(x.size):
+        x[i] = y[i] + scale * x[i]
 
 
 @_jit
@@ -3123,7 +3201,8 @@ def solve_joint(matrix, gradient, indptr, neighbour, blocks, node, share,
     Stars couple to their neighbours (`pair_blocks`) and to the four nodes
     node (n, 4) of the background around them, with the bilinear shares
     share (n, 4); mesh (m, m) is the background's own matrix. Each star's own
-    block is the preconditioner. Returns the number of steps.
+    block is the preconditioner; stars whose block is singular do not move.
+    Returns the number of steps.
     """
     n = gradient.shape[0]
     inverse = np.empty((n, 3, 3))
@@ -3131,38 +3210,26 @@ def solve_joint(matrix, gradient, indptr, neighbour, blocks, node, share,
         _invert_3x3(matrix[i], inverse[i])
     step[:] = 0
     mesh_step[:] = 0
-    r = gradient.copy()
-    for i in range(n):
-        if inverse[i, 0, 0] == 0:
-            r[i] = 0
-    mesh_r = mesh_gradient.copy()
-    z = np.empty_like(r)
-    mesh_z = np.empty_like(mesh_r)
-    _precondition(inverse, mesh, r, mesh_r, z, mesh_z)
-    v = z.copy()
-    mesh_v = mesh_z.copy()
-    a = np.empty_like(r)
-    mesh_a = np.empty_like(mesh_r)
-    rz = (r * z).sum() + (mesh_r * mesh_z).sum()
+    r, mesh_r = gradient.copy(), mesh_gradient.copy()
+    z, mesh_z = np.empty_like(r), np.empty_like(mesh_r)
+    # A preconditioner of zero keeps singular stars out of z, and so of v.
+    rz = _precondition(inverse, mesh, r, mesh_r, z, mesh_z)
+    v, mesh_v = z.copy(), mesh_z.copy()
+    a, mesh_a = np.empty_like(r), np.empty_like(mesh_r)
     goal = tolerance * tolerance * rz
     for count in range(max_steps):
         if not rz > goal:
             return count
-        _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node,
-                     share, reach, mesh, a, mesh_a)
-        alpha = rz / ((v * a).sum() + (mesh_v * mesh_a).sum())
-        step += alpha * v
-        mesh_step += alpha * mesh_v
-        r -= alpha * a
-        mesh_r -= alpha * mesh_a
-        for i in range(n):
-            if inverse[i, 0, 0] == 0:
-                r[i] = 0
-        _precondition(inverse, mesh, r, mesh_r, z, mesh_z)
+        alpha = rz / _apply_joint(v, mesh_v, matrix, indptr, neighbour,
+                                  blocks, node, share, reach, mesh, a, mesh_a)
+        _add_scaled(step.reshape(-1), alpha, v.reshape(-1))
+        _add_scaled(mesh_step, alpha, mesh_v)
+        _add_scaled(r.reshape(-1), -alpha, a.reshape(-1))
+        _add_scaled(mesh_r, -alpha, mesh_a)
         before = rz
-        rz = (r * z).sum() + (mesh_r * mesh_z).sum()
-        v = z + rz / before * v
-        mesh_v = mesh_z + rz / before * mesh_v
+        rz = _precondition(inverse, mesh, r, mesh_r, z, mesh_z)
+        _extend(v.reshape(-1), rz / before, z.reshape(-1))
+        _extend(mesh_v, rz / before, mesh_z)
     return max_steps
 
 
@@ -3308,51 +3375,6 @@ def score(residual, weight, template, x_low, x_high, y_low, y_high, hint,
             if 3 * seen > power and info > 0:
                 flux[y, x] = (pr - ps * rs / ws) / info
                 significance[y, x] = flux[y, x] * sqrt(info)
-
-
-@_jit
-def background_equations(residual, weight, level, x_grid, y_grid, limit,
-                         information, gradient):
-    """
-    Put the information on each node of the background, and gradients.
-
-    A node, ordered by y, then x, is the mean of the sky over the pixels
-    nearest to it, so that it depends on nothing further away. Pixels more
-    than limit standard errors from the model take no part.
-    """
-    index = np.empty(4, np.int64)
-    share = np.empty((3, 4))
-    information[:] = 0
-    gradient[:] = 0
-    for y in range(residual.shape[0]):
-        for x in range(residual.shape[1]):
-            w = weight[y, x]
-            r = residual[y, x]
-            if w == 0:
-                continue
-            blend_weights(float(x), float(y), x_grid, y_grid, index, share)
-            here = 0.0
-            node = 0
-            for a in range(4):
-                here += share[0, a] * level[index[a]]
-                if share[0, a] > share[0, node]:
-                    node = a
-            # All pixels count here: stars are coupled through all of theirs.
-            information[index[node]] += w
-            if w * r * r <= limit * limit:
-                gradient[index[node]] += w * (r + here - level[index[node]])
-
-
-@_jit
-def add_background(level, x_grid, y_grid, sign, image):
-    """Add sign times the bilinear background of the nodes to the image."""
-    index = np.empty(4, np.int64)
-    share = np.empty((3, 4))
-    for y in range(image.shape[0]):
-        for x in range(image.shape[1]):
-            blend_weights(float(x), float(y), x_grid, y_grid, index, share)
-            for a in range(4):
-                image[y, x] += sign * share[0, a] * level[index[a]]
 
 
 @_jit

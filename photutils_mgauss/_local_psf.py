@@ -5,7 +5,7 @@ Between four nodes of a grid the PSF is a sum of 4 K Gaussians, in four
 families of similar ones. Where one Gaussian with the weight, mean and
 covariance of its family can stand for it, K Gaussians do.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -47,6 +47,8 @@ class LocalPSF:
     are those of the nodes, weights in units of flux on the detector;
     ``order`` (cells along y, along x, 4, K) says which Gaussians of a cell's
     corners form a family, ``merged`` which cells' families are merged.
+    ``profile`` is the brightest pixel at each distance from a star in the
+    middle of the grid, ``area`` [pix^2] how large that star is.
     """
 
     x_grid: np.ndarray
@@ -57,6 +59,8 @@ class LocalPSF:
     integrated: bool
     order: np.ndarray
     merged: np.ndarray
+    profile: np.ndarray | None = None
+    area: float | None = None
 
     @classmethod
     def from_nodes(cls, x_grid, y_grid, weights, means, covariances,
@@ -69,7 +73,9 @@ class LocalPSF:
                   order, np.zeros(shape, bool))
         for j, i in np.ndindex(shape):
             psf._join_families(j, i)
-        return psf
+        stamp = psf.stamp(x_grid.mean(), y_grid.mean(), MAX_WING)
+        return replace(psf, profile=_profile(stamp),
+                       area=stamp.sum()**2 / (stamp**2).sum())
 
     @property
     def n_rows(self):
@@ -79,9 +85,7 @@ class LocalPSF:
 
     def moved(self, x, y):
         """Return the PSF with the origin of coordinates at (x, y)."""
-        return LocalPSF(self.x_grid - x, self.y_grid - y, self.weights,
-                        self.means, self.covariances, self.integrated,
-                        self.order, self.merged)
+        return replace(self, x_grid=self.x_grid - x, y_grid=self.y_grid - y)
 
     def _corners(self, j, i):
         i_next = np.minimum(i + 1, self.x_grid.size - 1)
@@ -150,6 +154,13 @@ class LocalPSF:
                 -1, 4 * k, 6)
         return rows, count
 
+    @staticmethod
+    def paces(rows):
+        """Return what the kernels' walks over Gaussians need beside rows."""
+        out = np.empty((*rows.shape[:2], 4))
+        _kernels.paces(rows, out)
+        return out
+
     def stamp(self, x, y, half):
         """Draw a star of unit flux in the middle of a stamp."""
         rows, count = self.rows_at(np.array([float(x)]), np.array([float(y)]))
@@ -158,15 +169,15 @@ class LocalPSF:
                         self.integrated, out)
         return out
 
-    def profile(self, x, y):
-        """Return the brightest pixel at each distance, never rising."""
-        stamp = self.stamp(x, y, MAX_WING)
-        distance = np.hypot(*np.mgrid[-MAX_WING:MAX_WING + 1,
-                                      -MAX_WING:MAX_WING + 1])
-        ring = np.rint(distance).astype(int).ravel()
-        top = np.zeros(ring.max() + 1)
-        np.maximum.at(top, ring, stamp.ravel())
-        return np.maximum.accumulate(top[MAX_WING::-1])[::-1]
+
+def _profile(stamp):
+    """Return the brightest pixel at each distance, never rising."""
+    distance = np.hypot(*np.mgrid[-MAX_WING:MAX_WING + 1,
+                                  -MAX_WING:MAX_WING + 1])
+    ring = np.rint(distance).astype(int).ravel()
+    top = np.zeros(ring.max() + 1)
+    np.maximum.at(top, ring, stamp.ravel())
+    return np.maximum.accumulate(top[MAX_WING::-1])[::-1]
 
 
 def _merge(weights, means, covariances):

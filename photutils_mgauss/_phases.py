@@ -37,62 +37,71 @@ def phase_rows(mixture, flux, shape, pitch, origin, used, sizes=SIZES):
     -------
     (len(sizes), n, 2, ny, nx) `~numpy.ndarray`
         For n phases the errors of x and y [native pix] as sums over the
-        residual, less their mean over the phases: a shift common to all is a
-        matter of where the centre is, not an error.
+        residual.
     """
-    n_phases = [p * max(1, -(-_MIN_PHASES // p)) for p in pitch.astype(int)]
-    steps = [np.arange(n) * p / n for n, p in zip(n_phases, pitch,
-                                                  strict=True)]
+    phases = [_phases_along(p) for p in pitch]
     peak = origin + mixture.moments().mean * pitch
-    rows = np.array([[
-        _rows_of_phase(mixture, flux, shape, pitch, origin, peak, size, x, y)
-        for y in steps[1] for x in steps[0]] for size in sizes])
-    rows *= used
-    return rows - rows.mean(axis=1, keepdims=True)
+    return used * np.array([
+        _rows_of_size(mixture, flux, shape, pitch, origin, peak, size, *phases)
+        for size in sizes])
 
 
-def _rows_of_phase(mixture, flux, shape, pitch, origin, peak, size, x, y):
-    """Return the rows (2, ny, nx) of one phase, (x, y) image pixels."""
+def _phases_along(pitch):
+    """Return phases within a native pixel, in image pixels (m,)."""
+    n = int(pitch) * max(1, -(-_MIN_PHASES // int(pitch)))
+    return np.arange(n) * pitch / n
+
+
+def _rows_of_size(mixture, flux, shape, pitch, origin, peak, size, x, y):
+    """Return rows (n, 2, ny, nx) for phases x (mx,) by y (my,)."""
     columns = _positions(peak[0], pitch[0], x, size)
     lines = _positions(peak[1], pitch[1], y, size)
-    u, v = np.meshgrid((columns - origin[0]) / pitch[0],
-                       (lines - origin[1]) / pitch[1])
-    slope = mixture.gradient(u, v).reshape(-1, 2)
-    jacobian = np.column_stack([-flux * slope, mixture.evaluate(u, v).ravel()])
-    errors = np.linalg.pinv(jacobian)[:2].reshape(2, size, size)
-    across = _interpolation(columns, shape[1])
-    down = _interpolation(lines, shape[0])
-    return np.einsum('cij,iy,jx->cyx', errors, down, across)
+    u = (columns - origin[0])[None, :, None, :] / pitch[0]
+    v = (lines - origin[1])[:, None, :, None] / pitch[1]
+    slope, value = mixture.gradient(u, v), mixture.evaluate(u, v)
+    jacobian = np.stack([-flux * slope[..., 0], -flux * slope[..., 1], value],
+                        axis=-1).reshape(len(y), len(x), size**2, 3)
+    errors = np.linalg.pinv(jacobian)[:, :, :2]
+    errors = errors.reshape(len(y), len(x), 2, size, size)
+    across = _interpolation(columns, shape[1])[None, :, None]
+    down = _interpolation(lines, shape[0])[:, None, None]
+    rows = np.swapaxes(down, -1, -2) @ (errors @ across)
+    return rows.reshape(-1, 2, *shape)
 
 
-def _positions(peak, pitch, phase, size):
-    """Return where a stamp's native pixels are, in image pixels (size,)."""
-    nearest = np.rint((peak - phase) / pitch)
-    return phase + pitch * (nearest + np.arange(size) - size // 2)
+def _positions(peak, pitch, phases, size):
+    """Return where stamps' native pixels are, in image pixels (m, size)."""
+    nearest = np.rint((peak - phases) / pitch)
+    offsets = nearest[:, None] + np.arange(size) - size // 2
+    return phases[:, None] + pitch * offsets
 
 
 def _interpolation(positions, n):
     """
-    Return the matrix (len(positions), n) that interpolates n pixels there.
+    Return the matrix (..., n) that interpolates n pixels at positions (...).
 
     Lagrange's polynomial through the six nearest pixels; beyond the edge
     the image is zero.
     """
-    matrix = np.zeros((len(positions), n + 12))
-    for row, position in zip(matrix, positions, strict=True):
-        first = int(np.floor(position)) - 2
-        if not -6 <= first <= n:
-            continue
-        nodes = np.arange(first, first + 6)
-        for node in nodes:
-            others = nodes[nodes != node]
-            row[node + 6] = np.prod((position - others) / (node - others))
-    return matrix[:, 6:n + 6]
+    first = np.floor(positions).astype(int) - 2
+    nodes = np.arange(6)
+    apart = nodes[:, None] - nodes
+    away = (positions - first)[..., None] - nodes
+    # For each node the product over the five others.
+    factors = away[..., None, :] / np.where(apart == 0, 1, apart)
+    weights = np.where(apart == 0, 1.0, factors).prod(axis=-1)
+    matrix = np.zeros((*positions.shape, n + 12))
+    places = np.clip(first[..., None] + 6, 0, n + 6) + nodes
+    np.put_along_axis(matrix, places, weights, axis=-1)
+    return matrix[..., 6:n + 6]
 
 
 def phase_error(rows, residual):
     """
     Return the root mean square centroid error over phases and axes.
+
+    A shift common to all phases is a matter of where the centre is and not
+    an error.
 
     Parameters
     ----------
@@ -108,4 +117,4 @@ def phase_error(rows, residual):
     """
     errors = np.tensordot(rows, np.where(np.isfinite(residual), residual, 0),
                           2)
-    return np.sqrt((errors**2).mean(axis=(1, 2)))
+    return np.sqrt(errors.var(axis=1).mean(axis=1))

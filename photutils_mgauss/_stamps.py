@@ -22,10 +22,14 @@ _MIN_STDDEV = 0.4
 # power of the image.
 _TIE = 1e6
 _STIFFNESS = 1.0
-# What a centroid error of one native pixel costs, in the same unit, and how
-# often the map to centroid errors follows the solution.
-_ASTROMETRY = 100.0
-_ASTROMETRY_ROUNDS = 2
+# What a centroid error of one native pixel costs, in the same unit, rising so
+# that no step goes far. At each price the map to centroid errors follows the
+# solution so many times, each after so many steps, or until the cost changes
+# by less than this fraction.
+_ASTROMETRY = (1.0, 10.0, 100.0)
+_ASTROMETRY_ROUNDS = 8
+_ASTROMETRY_STEPS = 4
+_ASTROMETRY_TOLERANCE = 1e-2
 # The steps every split gets, and the better half again; how many of the best
 # go on at the end; and the steps of fits with fewer Gaussians than asked for,
 # which need not converge.
@@ -179,12 +183,35 @@ def _improved(stamp, problem, spaces, starts, steps):
 
 
 def refine_astrometry(stamp, problem, spaces, solution):
-    """Return the solution refitted with centroid errors in its cost."""
-    for _ in range(_ASTROMETRY_ROUNDS):
-        rows = _phase_rows(stamp, problem, solution)
-        solution = run(stamp._replace(rows=rows), problem, spaces,
-                       solution.shapes)
-    return solution
+    """
+    Return the solution refitted with centroid errors in its cost.
+
+    The map from residuals to centroid errors changes with the model: a few
+    steps are taken with one map, then the next is made. Each solution is
+    judged by its own map and the best is kept.
+    """
+    for price in _ASTROMETRY:
+        mapped, solution = _price(stamp, problem, spaces, solution, price)
+        best, stopped = solution, True
+        for _ in range(_ASTROMETRY_ROUNDS):
+            trial = run(mapped, problem, spaces, solution.shapes,
+                        _ASTROMETRY_STEPS)
+            mapped, trial = _price(stamp, problem, spaces, trial, price)
+            change = abs(trial.cost - solution.cost)
+            solution = trial
+            best = min(best, solution, key=lambda each: each.cost)
+            if change < _ASTROMETRY_TOLERANCE * best.cost:
+                stopped = False
+                break
+        solution = best
+    return solution._replace(stopped=stopped)
+
+
+def _price(stamp, problem, spaces, solution, price):
+    """Return the stamp with a solution's own map, and the cost by it."""
+    rows = np.sqrt(price) * _phase_rows(stamp, problem, solution)
+    stamp = stamp._replace(rows=rows)
+    return stamp, run(stamp, problem, spaces, solution.shapes, 0)
 
 
 def _phase_rows(stamp, problem, solution):
@@ -195,10 +222,9 @@ def _phase_rows(stamp, problem, solution):
                       stamp.weight > 0)
     rows = rows.reshape(-1, stamp.pixels.size)
     # The rows count by the sum of their squares alone, so rotated ones do.
-    _, size, directions = np.linalg.svd(rows, full_matrices=False)
-    seen = size > 1e-4 * size[0]
-    rows = np.sqrt(_ASTROMETRY) * size[seen, None] * directions[seen]
-    return np.ascontiguousarray(rows).reshape(-1, *stamp.pixels.shape)
+    power, directions = np.linalg.eigh(rows @ rows.T)
+    seen = power > 1e-8 * power[-1]
+    return (directions[:, seen].T @ rows).reshape(-1, *stamp.pixels.shape)
 
 
 def _core(stamp, problem):

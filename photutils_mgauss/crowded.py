@@ -18,7 +18,12 @@ from photutils_mgauss import _injection as injection
 from photutils_mgauss import _kernels
 from photutils_mgauss._crowded_image import Image, find_gain
 from photutils_mgauss._crowded_table import StarTable, as_qtable, tabulate
-from photutils_mgauss._crowded_tile import TileJob, TileOptions, solve_tile
+from photutils_mgauss._crowded_tile import (
+    CELL,
+    TileJob,
+    TileOptions,
+    solve_tile,
+)
 from photutils_mgauss._injection import InjectionResult
 from photutils_mgauss._local_psf import LocalPSF
 from photutils_mgauss._parallel import available_cores
@@ -237,12 +242,14 @@ class CrowdedMixturePhotometry:
         if gain is None:
             gain = find_gain(image)
         good = image.variance > 0
-        floor = image.variance[good].min() if good.any() else 1.0
+        variance = image.variance[good] if good.any() else np.ones(1)
         return TileOptions(
             threshold=self.threshold, keep=self.keep,
             background_size=self.background_size, psf_error=self.psf_error,
             gain=None if gain in (None, np.inf) else float(gain),
-            floor=float(floor), max_rounds=self.maxiters)
+            floor=float(variance.min()),
+            noise=float(np.sqrt(np.median(variance))),
+            max_rounds=self.maxiters)
 
     def _run(self, jobs):
         """Return the outcome of each job, None where it failed."""
@@ -418,13 +425,15 @@ def _window(core, size, overlap, spacing):
     """
     Return which pixels a tile sees along an axis.
 
-    It sees all of those that the background nodes around its core rest on.
+    It sees all of those that the background in its core rests on, nodes up
+    to one beyond it, and whole cells of the PSF.
     """
     low, high = core[0] - overlap, core[1] + overlap
     if spacing:
-        low = min(low, (core[0] // spacing - 0.5) * spacing)
-        high = max(high, (-(-core[1] // spacing) + 0.5) * spacing)
-    return max(0, int(np.floor(low))), min(size, int(np.ceil(high)) + 1)
+        low = min(low, (core[0] // spacing - 1.5) * spacing)
+        high = max(high, (-(-core[1] // spacing) + 1.5) * spacing)
+    return (max(0, int(low // CELL) * CELL),
+            min(size, -int(-high // CELL) * CELL))
 
 
 def _clipped(core, shape):
@@ -479,9 +488,10 @@ def _draw(psf, x, y, flux, shape, psf_shape):
     one = np.ones(x.size, np.int64)
     rows, count = psf.rows_at(x, y)
     left, bottom = (np.rint(v).astype(np.int64) for v in (x, y))
+    faintest = 1e-7 * max(np.abs(flux).max(initial=0), 1e-300)
     _kernels.add_stars(np.arange(x.size), 1.0, x, y, flux, left, bottom, one,
                        0 * one, wing.astype(np.int64), np.empty((3, 1)),
-                       rows, count, psf.integrated, image)
+                       rows, count, psf.integrated, faintest, image)
     return image
 
 

@@ -26,7 +26,8 @@ MIXTURE = GaussianMixture([0.8, 0.2], [[0, 0], [0.1, 0]],
                           [[[0.6, 0.05], [0.05, 0.5]], [[3, 0], [0, 3]]])
 PSF = GriddedMixturePSF([MIXTURE], [(0, 0)])
 OPTIONS = TileOptions(threshold=4.5, keep=2.5, background_size=64,
-                      psf_error=0.0, gain=None, floor=1.0, max_rounds=6)
+                      psf_error=0.0, gain=None, floor=1.0, noise=1.0,
+                      max_rounds=6)
 
 
 def photometry(**kwargs):
@@ -125,7 +126,7 @@ def test_gauss_newton_finds_a_noiseless_blend_again():
     tile.stars = Stars(x + 0.15, y - 0.1, 0.8 * flux, n_rows=tile.psf.n_rows)
     tile.refresh()
     for _ in range(40):
-        tile.step(1e-8)
+        tile.step()
     assert_allclose(tile.stars.x, x, atol=2e-3)
     assert_allclose(tile.stars.flux, flux, rtol=2e-3)
     assert_allclose(tile.level, 5, atol=0.02)
