@@ -3,6 +3,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -214,6 +215,38 @@ def test_a_crowded_measurement_finds_the_same_stars(chain, monkeypatch):
     sparse, _ = beside_truth(chain, QTable.read(chain / 'night1_cat.ecsv'))
     shared = set(found['x_fit'].round(1)) & set(sparse['x_fit'].round(1))
     assert len(shared) > 0.8 * len(sparse)
+
+
+def test_a_catalogue_remembers_the_wcs_it_was_measured_with(chain,
+                                                            monkeypatch):
+    monkeypatch.chdir(chain)
+    for number in (1, 2):
+        assert main(['photometry', f'images/night{number}.fits', '--psf',
+                     f'night{number}_psf.fits', '--wcs',
+                     f'images/night{number}_wcs.asdf', '--output',
+                     f'gwcs/night{number}_cat.ecsv', '--quiet']) == 0
+    assert main(['motions', 'gwcs/night1_cat.ecsv', 'gwcs/night2_cat.ecsv',
+                 '--output', 'gwcs/motions', '--quiet']) == 0
+    assert {'night1_wcs.asdf', 'night2_wcs.asdf'} <= set(
+        files_in('gwcs/motions'))
+
+
+def test_without_its_image_a_catalogue_still_has_its_places(chain, tmp_path,
+                                                            monkeypatch):
+    monkeypatch.chdir(chain)
+    names = ['night1_cat.ecsv', 'night2_cat.ecsv']
+    moved = [shutil.copy(name, tmp_path) for name in names]
+    common = ['--transform', 'similarity', '--quiet', '--output']
+    assert main(['motions', *names, *common, str(tmp_path / 'one')]) == 0
+    assert main(['motions', *moved, *common, str(tmp_path / 'two')]) == 0
+    one, two = (QTable.read(tmp_path / name / 'motions.ecsv')
+                for name in ('one', 'two'))
+    for column in ('pmra', 'pmdec', 'pmra_error', 'pmra_pmdec_corr'):
+        np.testing.assert_allclose(
+            np.asarray(one[column]), np.asarray(two[column]), rtol=1e-4,
+            atol=1e-4)
+    assert files_in(tmp_path / 'two') == [
+        'alignment.ecsv', 'motions.ecsv', 'residuals.ecsv']
 
 
 def test_psfs_are_rewritten_and_used_in_the_other_format(chain, capsys):
