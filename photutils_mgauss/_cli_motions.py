@@ -157,6 +157,8 @@ def _from_image(options, image, names, i):
     """Return the epoch of an image; write its PSF and catalogue."""
     if image.wcs is None and not options.plane:
         raise ValueError(_no_sky(image.path))
+    if image.time is None:
+        raise ValueError(_no_time(image.path))
     psf, found = psf_command.from_stars(image, options)
     psf_command.write(psf, names.psfs[i], tools.record_of(
         options, input=str(image.path), **found))
@@ -203,9 +205,7 @@ def _epoch(options, path, table, wcs, time):
     """Return the `Epoch` of a table, its flagged rows left out."""
     from photutils_mgauss.proper_motion import Epoch
     if time is None and 'time' not in table.colnames:
-        msg = (f'{path}: the time must be known; the header has none, give '
-               '--time')
-        raise ValueError(msg)
+        raise ValueError(_no_time(path))
     table = _usable(table, options.good_flags)
     wcs = None if options.plane else wcs
     if wcs is None and not options.plane:
@@ -241,6 +241,10 @@ def _on_the_sky(path, table):
 def _no_sky(path):
     return (f'{path}: must have a WCS or columns ra and dec, got neither; '
             'give --wcs, or --plane for motions in pixels')
+
+
+def _no_time(path):
+    return f'{path}: the time must be known; its header has none, give --time'
 
 
 def _fit(epochs, options):
