@@ -223,7 +223,9 @@ def _reject(state, residual, variance):
     middle = problem.stamps.corners + problem.stamps.radius
     moved = np.abs(problem.sources[:, 0, :2] - middle).max(axis=1)
     used &= moved < max(2.0, 0.3 * problem.stamps.radius)
-    problem.used = used
+    # Of two stars, both may deviate from their mean.
+    if used.any():
+        problem.used = used
 
 
 def _deviant_pixels(pulls, used):
@@ -257,8 +259,10 @@ def run(problem, n_components, degree, workers, *, strength=1.0, reject=True):
     """
     state = _first_state(problem, n_components, degree, strength, workers)
     brightest = np.argsort(-problem.sources[:, 0, 2])
-    for low in range(degree):
+    for low in range(degree + 1):
         count = _STARS_PER_TERM * n_terms(low + 1)
+        if low == degree and count >= len(brightest):
+            break
         _stage(state, np.sort(brightest[:count]), low, workers, reject)
     return _finish(state, degree, workers, reject)
 
@@ -355,7 +359,7 @@ def _finish(state, degree, workers, reject):
     for share, tolerance in ((0.3, 0.3), (0.3, 0.1), (1, 0.01)):
         _fit_blurs(state, workers)
         weigh(state, reject=reject, share=share)
-        advance(state, workers, tolerance=tolerance)
+        advance(state, workers, tolerance=tolerance, max_steps=8)
     for _ in range(_ADAPTATIONS if degree else 0):
         _adapt(state, workers, reject)
     return state
@@ -367,7 +371,7 @@ def _adapt(state, workers, reject):
         state.coefficients, state.equations.matrix,
         _groups(state.coefficients, state.problem.form.kinds))
     weigh(state, reject=reject)
-    advance(state, workers, tolerance=0.01)
+    advance(state, workers, tolerance=0.01, max_steps=10)
 
 
 def _groups(coefficients, kinds):

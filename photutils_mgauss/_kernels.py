@@ -1824,6 +1824,11 @@ _FAIR_GAIN = 0.75
 # The least factor by which steps are taken to get shorter.
 _LEAST_RATE = 0.03
 
+# Out of iterations, fits whose chi2 fell by a smaller fraction than this in
+# the last step count as good, as they do in scipy: along a valley, such as
+# that of two stars in one place, steps may remain long.
+_LEAST_FALL = 1e-8
+
 
 # The PSF of a star and its derivatives by position are summed in a tile, one
 # flat array: for each pixel column _LANES values of the PSF, as many of its
@@ -2363,6 +2368,7 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
     floor = 1e-24 * best
     damping = 0.0
     last = 0.0
+    fall = np.inf
     for iteration in range(max_iterations):
         _freeze(parameters, lower, upper, old[3], fixed, size, frozen)
         if not _factorize(old[2], frozen, damping, size, steepest, scale,
@@ -2391,6 +2397,7 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
         # Of a smaller fall nothing is left after rounding: keep the damping.
         gain = ((best - chi2[0]) / expected if expected > 1e-9 * best
                 else _POOR_GAIN)
+        fall = best - chi2[0]
         parameters[:size] = trial[:size]
         best = chi2[1]
         for source, target in ((new[0], old[0]), (new[1], old[1])):
@@ -2401,7 +2408,8 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
             return _CONVERGED, iteration + 2
         last = length
         damping = _next_damping(damping, gain)
-    return _NOT_CONVERGED, max_iterations + 1
+    return (_STALLED if fall < _LEAST_FALL * best else _NOT_CONVERGED,
+            max_iterations + 1)
 
 
 @_jit

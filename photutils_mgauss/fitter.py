@@ -21,7 +21,7 @@ __all__ = ['MixtureFitter']
 
 _MESSAGES = {
     0: 'The fit stopped at its largest number of iterations.',
-    2: 'No step makes the sum of squares smaller.',
+    2: 'The sum of squares does not get smaller any more.',
     3: 'The next step is expected to be below the tolerance.',
 }
 
@@ -30,11 +30,16 @@ _TOLERANCE = 1e-6
 
 # What fraction of the fall of chi2 that the normal equations promise a step
 # should bring: below the first damping grows, above the second it falls.
-_POOR_GAIN = 0.25
-_FAIR_GAIN = 0.75
+POOR_GAIN = 0.25
+FAIR_GAIN = 0.75
 
 # The least factor by which steps are taken to get shorter.
 _LEAST_RATE = 0.03
+
+# Out of steps, fits whose chi2 fell by a smaller fraction than this in the
+# last one count as good, as they do in scipy: along a valley, such as that of
+# two stars in one place, steps may remain long.
+_LEAST_FALL = 1e-8
 
 # Matrices scaled to a diagonal of one whose Cholesky factor has a smaller
 # square than this on its diagonal are taken for singular.
@@ -300,6 +305,7 @@ def _minimize(problem, max_steps):
                      problem.upper)
     state = problem.evaluate(values)
     damping, last, steepest = 0.0, 0.0, np.zeros(values.size)
+    fall = np.inf
     for n in range(max_steps):
         steepest = np.maximum(steepest, np.diag(state.matrix))
         step = _bounded_step(problem, state, damping * steepest)
@@ -313,12 +319,13 @@ def _minimize(problem, max_steps):
             damping, last = max(10 * damping, 1e-3), 0.0
             continue
         length = state.length(_undamped(problem, state, step, damping))
-        gain = _gain(state, new, step)
+        gain, fall = _gain(state, new, step), state.chi2 - new.chi2
         state = new
         if _remainder(length, last) < _TOLERANCE:
             return state, 3, n + 2
-        last, damping = length, _next_damping(damping, gain)
-    return state, 0, max_steps + 1
+        last, damping = length, next_damping(damping, gain)
+    status = 2 if fall < _LEAST_FALL * state.chi2 else 0
+    return state, status, max_steps + 1
 
 
 def _gain(state, new, step):
@@ -327,15 +334,19 @@ def _gain(state, new, step):
     if expected > 1e-9 * state.chi2:
         return (state.chi2 - new.chi2) / expected
     # Of a smaller fall nothing is left after rounding: keep the damping.
-    return _POOR_GAIN
+    return POOR_GAIN
 
 
-def _next_damping(damping, gain):
-    # A faint star needs some even at its minimum, where the curvature that
-    # the normal matrix leaves out makes undamped steps overshoot.
-    if gain < _POOR_GAIN:
+def next_damping(damping, gain):
+    """
+    Return the damping after a step that brought gain of what it promised.
+
+    A faint star needs some even at its minimum, where the curvature that the
+    normal matrix leaves out makes undamped steps overshoot.
+    """
+    if gain < POOR_GAIN:
         return max(4 * damping, 1e-2)
-    if gain < _FAIR_GAIN:
+    if gain < FAIR_GAIN:
         return damping
     return damping / 10 if damping > 1e-4 else 0.0
 

@@ -413,31 +413,3 @@ def test_any_executor_gives_the_same_table(grid, rng):
         got = MixturePSFPhotometry(grid, 9, executor=pool)(data, **call)
     for name in want.colnames:
         assert_array_equal(got[name], want[name])
-
-
-def test_an_interrupt_ends_the_fit_at_once(grid, rng):
-    import signal
-    import time
-    from concurrent.futures import ThreadPoolExecutor
-    x, y, flux = isolated(rng)
-    data, error = draw(grid, x, y, flux)
-    few = guess(x, y, flux, rng)
-    many = QTable({name: np.tile(few[name], 20_000)
-                   for name in few.colnames})
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-    before = signal.signal(signal.SIGALRM, interrupt)
-    with ThreadPoolExecutor(1) as pool:
-        fit = MixturePSFPhotometry(grid, 9, executor=pool)
-        fit(data, error=error, init_params=few)
-        start = time.process_time()
-        signal.setitimer(signal.ITIMER_REAL, 2.5)
-        try:
-            with pytest.raises(KeyboardInterrupt):
-                fit(data, error=error, init_params=many)
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, before)
-    # The whole would be ten seconds of work in one thread.
-    assert time.process_time() - start < 5
