@@ -153,6 +153,11 @@ class EmpiricalPSF:
             Flux densities [1 / pix^2] with the flux centroid in the middle
             sample; the sum over ``oversampling``\ :sup:`2` is the share of
             the flux in the image.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not valid.
         """
         x, y = as_real(x, 'x'), as_real(y, 'y')
         fine = (self.oversampling if oversampling is None
@@ -182,6 +187,11 @@ class EmpiricalPSF:
         -------
         `~photutils.psf.GriddedPSFModel`
             From it `GriddedMixturePSF.from_gridded_psf` makes mixtures.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not valid.
         """
         from astropy.nddata import NDData
         from photutils.psf import GriddedPSFModel

@@ -193,6 +193,11 @@ class MixtureField(Field):
         GaussianMixture
             Of K Gaussians, its flux centroid at the origin. It contains the
             pixel.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not valid.
         """
         x, y = as_real(x, 'x'), as_real(y, 'y')
         weights, means, covariances, _ = self._mixtures([x], [y], exposure)
@@ -231,6 +236,11 @@ class MixtureField(Field):
         Returns
         -------
         GriddedMixturePSF
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not valid.
         """
         x, y = lattice(as_shape(grid_shape, 'grid_shape'), self.shape)
         arrays = self._mixtures(x, y, exposure)[:3]

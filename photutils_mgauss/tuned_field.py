@@ -171,6 +171,11 @@ class TunedMixtureField(Field):
         Returns
         -------
         GriddedMixturePSF
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not valid.
         """
         if grid_shape is not None or not hasattr(self.start, 'grid_xypos'):
             grid_shape = as_shape(grid_shape or (30, 30), 'grid_shape')
