@@ -5,8 +5,8 @@ import numpy as np
 from astropy.table import QTable, Table
 from matplotlib.figure import Figure as Canvas
 from peers import (
+    INSTALL,
     AbsentError,
-    absent,
     crowdsource,
     psfex,
     sextractor,
@@ -170,7 +170,8 @@ def with_crowdsource(crowd):
 
 def left_out(name, crowd):
     """Say that a program is not run."""
-    raise absent(name)
+    msg = f'this command does not run it ({INSTALL[name]})'
+    raise AbsentError(msg)
 
 
 def _plain(table):
