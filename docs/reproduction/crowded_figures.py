@@ -407,4 +407,5 @@ GROUPS = (Group('crowded', measure, (
            'centring conventions is taken out of every list. In the lines '
            'below, the error of the crowded fit is that for the stars '
            "SExtractor found, too; that of the paper's own way, star by "
-           'star, is for the stars it found itself.', draw_errors, compare_errors))),)
+           'star, is for the stars it found itself.', draw_errors,
+           compare_errors))),)
