@@ -677,7 +677,8 @@ def plot_proper_motions(ax, stars):
     `~matplotlib.axes.Axes`
         The same; reference objects are orange.
     """
-    reference = np.asarray(stars['reference']) != ''
+    # A file gives the empty words of stars back as missing ones.
+    reference = np.ma.filled(stars['reference'], '') != ''
     for which, colour, label in ((~reference, BLUE, 'stars'),
                                  (reference, ORANGE, 'references')):
         some = stars[which]
