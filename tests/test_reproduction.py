@@ -93,3 +93,12 @@ def test_a_star_counts_once_however_many_are_listed():
     i, j = _pairs(listed, truth, 20.0, 0.5, 1.0)
     assert sorted(zip(i.tolist(), j.tolist(), strict=True)) == [(1, 0),
                                                                (2, 1)]
+
+
+def test_positions_keep_all_their_digits_until_they_are_summed_up(store,
+                                                                  tmp_path):
+    run = make_run(store, tmp_path)
+    place = 1234.567890123
+    run.table('one', lambda: table_of(place), keep=False)
+    again = run.table('one', lambda: table_of(0.0), keep=False)
+    assert again['value'][0] == place

@@ -20,8 +20,8 @@ INSTALL = {
                    'own, then --crowdsource-python',
     'photutils': 'pip install photutils',
     'GalSim': 'pip install galsim',
-    'DAOPHOT': 'apt-get install iraf-noao; not run by this script',
-    'DOLPHOT': 'not packaged by Debian or PyPI, and not run here',
+    'DAOPHOT': 'apt-get install iraf-noao',
+    'DOLPHOT': 'in neither Debian nor PyPI',
 }
 
 _COLUMNS = ('X_IMAGE', 'Y_IMAGE', 'XWIN_IMAGE', 'YWIN_IMAGE', 'FLUX_AUTO',

@@ -78,6 +78,7 @@ def main(argv=None):
         if chosen:
             done |= make(run, group, chosen)
     summary.write(run, [done[key] for key in ORDER if key in done],
+                  [key for key in ORDER if key not in done],
                   command(options))
     for name, why in run.skipped.items():
         print(f'left out: {name}: {why}')

@@ -141,7 +141,9 @@ def forget(size):
 
 def background_free(scene):
     """Return the image without its background, and the background's noise."""
-    found = Background2D(scene.image, 64, mask=scene.mask)
+    # A saturated star may take much of a box.
+    found = Background2D(scene.image, 64, mask=scene.mask,
+                         exclude_percentile=50)
     return scene.image - found.background, found.background_rms
 
 

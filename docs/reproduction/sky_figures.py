@@ -272,13 +272,14 @@ def draw_epochs(tables):
         sky = taken.wcs(_shape_of(table), PIXEL)(x, y)
         # Rings in each other: the exposures show the same sources.
         left.plot(*sky, 'o', mfc='none', color=COLOURS[number],
-                  markersize=1 + 0.8 * number, markeredgewidth=0.5,
+                  markersize=1 + 0.5 * number, markeredgewidth=0.5,
                   label=f'{taken.time.utc.isot[:10]}, {taken.band.name}')
     left.set(xlabel='right ascension [deg]', ylabel='declination [deg]')
     left.invert_xaxis()
     left.ticklabel_format(useOffset=False)
     left.tick_params(axis='x', labelrotation=30)
-    left.legend(fontsize=6, loc='upper right', framealpha=0.9)
+    left.legend(fontsize=6, loc='lower center', bbox_to_anchor=(0.5, 1.0),
+                ncols=4)
     everything = tables['sources']
     for kind, colour, line in (('star', COLOURS[0], '-'),
                                ('qso', COLOURS[4], '--')):
@@ -456,7 +457,9 @@ GROUPS = (Group('sky', measure, (
            'as in the paper. On the left the joint solution of '
            '``ProperMotionFitter``, with affine maps; on the right its '
            "``recipe='paper'`` with the standard error of the mean "
-           'displacement for Eq. 14.', draw_medians, compare_medians),
+           'displacement for Eq. 14. A median depends on how bright the '
+           'sources are: Fig. 8 shows ours, Fig. 12 the errors by '
+           'magnitude.', draw_medians, compare_medians),
     Figure('fig12', 'Fig. 12: errors of the motions of quasars',
            'Joint solution. Top: median stated error, which contains that of '
            'the frame, with the 1-sigma band of the bootstrap. Bottom: the '

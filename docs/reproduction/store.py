@@ -58,7 +58,8 @@ class Run:
             found = QTable.read(path)
             if found.meta.get('settings') == self.fingerprint:
                 return found
-        table = _rounded(function())
+        # What is measured again from must keep all its digits.
+        table = _rounded(function()) if keep else QTable(function())
         table.meta |= {'settings': self.fingerprint, **provenance()}
         path.parent.mkdir(parents=True, exist_ok=True)
         table.write(path, overwrite=True)

@@ -1,7 +1,7 @@
 """The page: every figure with its numbers beside the printed ones."""
 import textwrap
 
-from peers import INSTALL, program_versions
+from peers import program_versions
 from store import provenance
 
 _HEAD = """\
@@ -34,15 +34,15 @@ _OPTICS = {
 }
 
 
-def write(run, done, command):
+def write(run, done, missing, command):
     """Write the page of the figures that were made."""
-    parts = [_head(run, command)]
+    parts = [_head(run, missing, command)]
     parts += [_section(run, figure, lines, command)
               for figure, lines in done]
     (run.folder / 'summary.rst').write_text('\n'.join(parts))
 
 
-def _head(run, command):
+def _head(run, missing, command):
     found = provenance() | program_versions(run.crowdsource_python)
     versions = ', '.join(f'{name} {value}' for name, value in found.items()
                          if name not in ('date', 'machine'))
@@ -60,20 +60,19 @@ def _head(run, command):
         "paper's of those of 135.")
     return _HEAD.format(
         date=found['date'], command=command, versions=_filled(versions),
-        sizes=_filled(sizes), skipped=_skipped(run))
+        sizes=_filled(sizes), skipped=_skipped(run, missing))
 
 
 def _filled(text, width=78):
     return textwrap.fill(text, width, break_long_words=False)
 
 
-def _skipped(run):
-    if not run.skipped:
-        return 'Nothing was left out.'
-    lines = ['Left out:', '']
-    for name, why in run.skipped.items():
-        lines.append(f'* {name}: {why or INSTALL[name]}.')
-    return '\n'.join(lines)
+def _skipped(run, missing):
+    lines = [f'* {name}: {why}.' for name, why in run.skipped.items()]
+    if missing:
+        lines.append(f'* {", ".join(missing)}: not asked for.')
+    return '\n'.join(['Left out:', '', *lines] if lines
+                     else ['Nothing was left out.'])
 
 
 def _section(run, figure, lines, command):
