@@ -1816,6 +1816,19 @@ _LONGEST = 1.0
 # a fraction of the flux.
 _STEP_TOLERANCE = 1e-6
 
+# What fraction of the fall of chi2 that the normal equations promise a step
+# should bring: below the first damping grows, above the second it falls.
+_POOR_GAIN = 0.25
+_FAIR_GAIN = 0.75
+
+# The least factor by which steps are taken to get shorter.
+_LEAST_RATE = 0.03
+
+# Out of iterations, fits whose chi2 fell by a smaller fraction than this in
+# the last step count as good, as they do in scipy: along a valley, such as
+# that of two stars in one place, steps may remain long.
+_LEAST_FALL = 1e-8
+
 
 # The PSF of a star and its derivatives by position are summed in a tile, one
 # flat array: for each pixel column _LANES values of the PSF, as many of its
@@ -2275,6 +2288,27 @@ def _step_size(step, parameters, matrix, n):
 
 
 @_jit
+def _undamp(step, matrix, gradient, frozen, size):
+    """Lengthen a damped step to what each parameter alone would go."""
+    for a in range(size):
+        if not frozen[a]:
+            step[a] = max(abs(step[a]), abs(gradient[a]) / matrix[a, a])
+
+
+@_jit
+def _remainder(length, last):
+    """
+    Return how far the minimum is expected to be after a step.
+
+    Convergence is linear at the worst, each step shorter than the last one by
+    the same factor. A first step, with a last one of 0, says nothing of it,
+    and early steps make it look better than it will be.
+    """
+    rate = max(length / last, _LEAST_RATE) if last > 0 else 0.5
+    return length * (rate / (1 - rate) if rate < 0.9 else 10.0)
+
+
+@_jit
 def _take_step(parameters, step, lower, upper, n, size, trial):
     """Put the bounded end of the step into trial, the actual into step."""
     for s in range(n):
@@ -2300,6 +2334,21 @@ def _expected(step, matrix, gradient, size):
 
 
 @_jit
+def _next_damping(damping, gain):
+    """
+    Return the damping after a step that brought gain of what it promised.
+
+    A faint star needs some even at its minimum, where the curvature that the
+    normal matrix leaves out makes undamped steps overshoot.
+    """
+    if gain < _POOR_GAIN:
+        return max(4 * damping, 1e-2)
+    if gain < _FAIR_GAIN:
+        return damping
+    return damping / 10 if damping > 1e-4 else 0.0
+
+
+@_jit
 def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
               limits, max_iterations, chi2):
     """
@@ -2318,7 +2367,8 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
     best = chi2[1]
     floor = 1e-24 * best
     damping = 0.0
-    last = 1.0
+    last = 0.0
+    fall = np.inf
     for iteration in range(max_iterations):
         _freeze(parameters, lower, upper, old[3], fixed, size, frozen)
         if not _factorize(old[2], frozen, damping, size, steepest, scale,
@@ -2331,33 +2381,35 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
             step[a] = 0.0 if frozen[a] else old[3][a]
         _solve(factor, scale, size, step)
         _take_step(parameters, step, lower, upper, n, size, trial)
-        length = _step_size(step, parameters, old[2], n)
         expected = _expected(step, old[2], old[3], size)
+        short = _step_size(step, parameters, old[2], n)
+        if damping > 0:
+            _undamp(step, old[2], old[3], frozen, size)
+        length = _step_size(step, parameters, old[2], n)
         _normal_equations(trial, n, fit_sky, pixels, psf, scratch, old, new,
                           chi2)
         if not chi2[0] <= best * (1 + 1e-12) + floor:
-            if length < 1e-3 * _STEP_TOLERANCE or damping > 1e12:
+            if short < 1e-3 * _STEP_TOLERANCE or damping > 1e12:
                 return _STALLED, iteration + 2
             damping = max(10 * damping, 1e-3)
-            last = 1.0
+            last = 0.0
             continue
-        poor = expected > 1e-9 * best and best - chi2[0] < 0.25 * expected
+        # Of a smaller fall nothing is left after rounding: keep the damping.
+        gain = ((best - chi2[0]) / expected if expected > 1e-9 * best
+                else _POOR_GAIN)
+        fall = best - chi2[0]
         parameters[:size] = trial[:size]
         best = chi2[1]
         for source, target in ((new[0], old[0]), (new[1], old[1])):
             target[:n] = source[:n]
         old[2][:size, :size] = new[2][:size, :size]
         old[3][:size] = new[3][:size]
-        # Convergence is linear at the worst: the next step is expected to
-        # be shorter than this one by the factor this one was.
-        if damping == 0 and length * min(1.0, length / last) < _STEP_TOLERANCE:
+        if _remainder(length, last) < _STEP_TOLERANCE:
             return _CONVERGED, iteration + 2
         last = length
-        if poor:
-            damping = max(4 * damping, 1e-2)
-        else:
-            damping = damping / 10 if damping > 1e-4 else 0.0
-    return _NOT_CONVERGED, max_iterations + 1
+        damping = _next_damping(damping, gain)
+    return (_STALLED if fall < _LEAST_FALL * best else _NOT_CONVERGED,
+            max_iterations + 1)
 
 
 @_jit
@@ -3121,7 +3173,10 @@ def _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node, share,
 
     Returns the product of v and the outcome.
     """
-    mesh_out[:] = mesh @ mesh_v
+    for m in range(mesh_v.size):
+        mesh_out[m] = 0.0
+        for n in range(mesh_v.size):
+            mesh_out[m] += mesh[m, n] * mesh_v[n]
     product = 0.0
     for i in range(v.shape[0]):
         level = 0.0

@@ -8,7 +8,7 @@ from photutils_mgauss._star_fits import CONVERGED
 
 _MESSAGES = {
     0: 'The fit stopped at its largest number of iterations.',
-    2: 'No step makes the sum of squares smaller.',
+    2: 'The sum of squares does not get smaller any more.',
     3: 'The next step is expected to be below the tolerance.',
 }
 

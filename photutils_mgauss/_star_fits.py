@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
+from tqdm.auto import tqdm
 
 from photutils_mgauss import _kernels
 from photutils_mgauss._parallel import available_cores
@@ -246,7 +247,7 @@ def _fit_chunk(image, psf, fit_sky, max_iterations, stars):
 
 
 def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
-              executor=None):
+              executor=None, progress_bar=False):
     """
     Fit all stars.
 
@@ -261,6 +262,8 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     max_iterations : int, optional
     executor : `~concurrent.futures.Executor`, optional
         Where the chunks are fitted; by default in a pool of threads.
+    progress_bar : bool, optional
+        Whether to show how many chunks are done.
 
     Returns
     -------
@@ -268,20 +271,22 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     """
     work = partial(_fit_chunk, image, psf, fit_sky, max_iterations)
     chunks = list(stars.chunks())
+    watch = partial(tqdm, desc='Fitting stars', total=len(chunks),
+                    disable=not progress_bar)
     if executor is not None:
-        return Fits.joined(_map_cancelling(executor, work, chunks))
+        return Fits.joined(_map_cancelling(executor, work, chunks, watch))
     n_threads = min(len(chunks), available_cores())
     if n_threads < 2:
-        return Fits.joined([work(chunk) for chunk in chunks])
+        return Fits.joined(list(watch(map(work, chunks))))
     with ThreadPoolExecutor(n_threads) as pool:
-        return Fits.joined(_map_cancelling(pool, work, chunks))
+        return Fits.joined(_map_cancelling(pool, work, chunks, watch))
 
 
-def _map_cancelling(executor, function, arguments):
+def _map_cancelling(executor, function, arguments, watch):
     """Map like an executor, but let nothing start after an exception."""
     futures = [executor.submit(function, argument) for argument in arguments]
     try:
-        return [future.result() for future in futures]
+        return [future.result() for future in watch(futures)]
     finally:
         for future in futures:
             future.cancel()

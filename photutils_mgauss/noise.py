@@ -123,6 +123,16 @@ class CramerRao:
     ----------
     covariance : (n, 3, 3) `~numpy.ndarray`
         Of flux, x and y of each star.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import GaussianMixture, cramer_rao
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[1, 0], [0, 4]]])
+    >>> bound = cramer_rao(psf, 1e4, fit_shape=31)
+    >>> bound.flux_err, bound.x_err, bound.y_err
+    (array([100.]), array([0.01]), array([0.02]))
+    >>> bound.covariance.shape
+    (1, 3, 3)
     """
 
     covariance: np.ndarray

@@ -240,7 +240,8 @@ class MixturePSFPhotometry(PSFPhotometry):
         fits = _star_fits.fit_stars(
             image, _star_fits.psf_arrays(self.psf_model), stars,
             fit_sky=self.fit_sky, executor=self.executor,
-            max_iterations=self.fitter_maxiters or 100)
+            max_iterations=self.fitter_maxiters or 100,
+            progress_bar=self.progress_bar)
         _check_errors(fits, stars)
         return start.result(rows, fits), counts[inverse]
 

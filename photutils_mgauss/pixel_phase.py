@@ -23,6 +23,16 @@ class PixelPhaseError:
         The median of the errors in each bin [pix], NaN where it is empty.
     error : (n_bins,) `~numpy.ndarray`
         The standard error of the median [pix].
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from photutils_mgauss import PixelPhaseError
+    >>> phase = PixelPhaseError(np.array([-0.25, 0.25]),
+    ...                         np.array([-0.002, 0.004]),
+    ...                         np.array([0.001, 0.001]))
+    >>> round(phase.half_range, 4)
+    0.003
     """
 
     phase: np.ndarray

@@ -19,7 +19,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import QTable
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import _kernels, fitter
 from photutils_mgauss._star_fits import (
     Image,
     cut_boxes,
@@ -37,7 +37,7 @@ from photutils_mgauss._wcs_tools import (
 
 __all__ = ['add_sky_positions', 'fit_many']
 
-_MAX_STEPS = 50
+_MAX_STEPS = 100
 
 # Of the next step [pix], as for single images.
 _TOLERANCE = 1e-6
@@ -394,13 +394,30 @@ def _minimize(scene, state):
         step[done] = 0
         trial = scene.evaluate(state.values + step)
         better = trial.chi2 <= state.chi2 * (1 + 1e-12) + 1e-300
-        done |= (length < _TOLERANCE) & (damping < 1e-3)
+        done |= (length < _TOLERANCE) & (damping < 1)
+        gain = _gain(state, trial, step)
         state = state.merge(trial, better & ~done)
-        damping = np.where(better, np.where(damping > 1e-4, damping / 10, 0),
+        damping = np.where(better, _next_damping(damping, gain),
                            np.maximum(10 * damping, 1e-3))
         if done.all():
             break
     return state, done
+
+
+def _gain(state, trial, step):
+    """Return what steps brought over what the normal equations promised."""
+    expected = (2 * np.einsum('ni,ni->n', step, state.gradient)
+                - np.einsum('ni,nij,nj->n', step, state.matrix, step))
+    # Of a smaller fall nothing is left after rounding: keep the damping.
+    known = expected > 1e-9 * state.chi2
+    return np.divide(state.chi2 - trial.chi2, expected, where=known,
+                     out=np.full(len(step), fitter.POOR_GAIN))
+
+
+def _next_damping(damping, gain):
+    """Do what fitter.next_damping does, for many stars."""
+    return np.array([fitter.next_damping(*pair)
+                     for pair in zip(damping, gain, strict=True)])
 
 
 def _steps(state, damping):

@@ -1,5 +1,6 @@
 """Laws of the fast photometry; the oracle is photutils itself."""
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -364,6 +365,21 @@ def test_the_fitter_serves_photutils_in_groups(grid, rng):
     check_same(theirs, ours)
 
 
+@pytest.mark.parametrize('photometry', [
+    MixturePSFPhotometry,
+    partial(PSFPhotometry, fitter=MixtureFitter())])
+def test_faint_stars_converge_too(grid, rng, photometry):
+    # At a signal to noise of four the curvature of the residuals is as large
+    # as that of the model, and undamped steps overshoot.
+    x, y, _ = isolated(rng)
+    flux = np.full(x.size, 180.0)
+    data, error = draw(grid, x, y, flux)
+    start = QTable({'x': x, 'y': y, 'flux': flux})
+    table = photometry(grid, (9, 9))(data, error=error, init_params=start)
+    assert 3 < np.median(table['flux_fit'] / table['flux_err']) < 6
+    assert not (table['flags'] & 8).any()
+
+
 @pytest.mark.parametrize('weighted', [False, True])
 def test_the_fitter_does_not_mind_the_unit_of_flux_or_the_origin(
         rng, weighted):
@@ -397,31 +413,3 @@ def test_any_executor_gives_the_same_table(grid, rng):
         got = MixturePSFPhotometry(grid, 9, executor=pool)(data, **call)
     for name in want.colnames:
         assert_array_equal(got[name], want[name])
-
-
-def test_an_interrupt_ends_the_fit_at_once(grid, rng):
-    import signal
-    import time
-    from concurrent.futures import ThreadPoolExecutor
-    x, y, flux = isolated(rng)
-    data, error = draw(grid, x, y, flux)
-    few = guess(x, y, flux, rng)
-    many = QTable({name: np.tile(few[name], 20_000)
-                   for name in few.colnames})
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-    before = signal.signal(signal.SIGALRM, interrupt)
-    with ThreadPoolExecutor(1) as pool:
-        fit = MixturePSFPhotometry(grid, 9, executor=pool)
-        fit(data, error=error, init_params=few)
-        start = time.process_time()
-        signal.setitimer(signal.ITIMER_REAL, 2.5)
-        try:
-            with pytest.raises(KeyboardInterrupt):
-                fit(data, error=error, init_params=many)
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, before)
-    # The whole would be ten seconds of work in one thread.
-    assert time.process_time() - start < 5

@@ -132,6 +132,54 @@ def test_positions_at_the_pole_have_errors_along_the_parallel():
         assert_allclose(table[name].value, 0.72, rtol=1e-6)
 
 
+def test_faint_stars_converge_in_one_image_and_in_three(rng):
+    # At a signal to noise of four; where undamped steps have to do, one in
+    # seven does not.
+    for n, flux in ((1, 180.0), (3, 120.0)):
+        sky, frames = images(rng, flux, n)
+        assert np.mean(fit_many(frames, sky)['converged']) > 0.95
+
+
+def real_or_linear_wcs(request, realdata):
+    """Return a gwcs of a real instrument, or a FITS WCS."""
+    if request == 'fits':
+        return make_wcs(0.4)
+    asdf = pytest.importorskip('asdf')
+    with asdf.open(realdata('nircam_wcs') / f'{request}wcs.asdf') as tree:
+        return tree['wcs']
+
+
+@pytest.mark.parametrize('which', ['fits', 'nircam', 'miri'])
+def test_photometry_on_the_sky_has_the_scatter_of_the_pixels(
+        which, realdata, rng):
+    wcs = real_or_linear_wcs(which, realdata)
+    x, y = lattice(rng)
+    light = sum(MIXTURE.render(SHAPE, a, b, flux=2e3)
+                for a, b in zip(x, y, strict=True))
+    error = np.sqrt(light + SKY)
+    data = light + error * rng.standard_normal(SHAPE)
+    start = QTable({'x': x, 'y': y, 'flux': np.full(x.size, 2e3)})
+    table = MixturePSFPhotometry(PSF, 11, xy_cov=True)(
+        data, error=error, init_params=start)
+    sky = add_sky_positions(table, wcs)
+    there = wcs.pixel_to_world(np.asarray(table['x_fit']),
+                               np.asarray(table['y_fit'])).icrs
+    found = SkyCoord(sky['ra'], sky['dec'])
+    assert found.separation(there).max() < 1e-3 * u.mas
+    # The covariance by throwing dice: pixels of one star, seen on the sky.
+    row = sky[7]
+    cross = row['xy_cov']
+    xy = rng.multivariate_normal(
+        [row['x_fit'], row['y_fit']],
+        [[row['x_err']**2, cross], [cross, row['y_err']**2]], 20_000)
+    east, north = there[7].spherical_offsets_to(
+        wcs.pixel_to_world(*xy.T).icrs)
+    want = np.cov(east.to_value(u.mas), north.to_value(u.mas))
+    got = [[row['ra_err'].value**2, row['radec_cov'].value],
+           [row['radec_cov'].value, row['dec_err'].value**2]]
+    assert_allclose(got, want, rtol=0.05, atol=0.02 * np.trace(want))
+
+
 @pytest.mark.parametrize(('images', 'error'), [
     ([], ValueError), ([(np.zeros((9, 9)), PSF)], ValueError),
     ([(np.zeros((9, 9)), PSF, None)], TypeError),
