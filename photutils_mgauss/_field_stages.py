@@ -170,9 +170,10 @@ def weigh(state, *, reject, share=1.0):
     """
     Renew weights and rejections from the present model, in place.
 
-    The variance is that of the model, not of the data. It includes the
-    present relative error of the PSF: while the model is still poor, bright
-    stars would otherwise drown all others, and every star would be deviant.
+    The variance is that of the model, not of the data. It includes ``share``
+    of the present relative error of the PSF, or with None what it included
+    before: while the model is still poor, bright stars would otherwise drown
+    all others, and every star would be deviant.
     """
     problem = state.problem
     stamps, good = problem.stamps, problem.stamps.good
@@ -184,7 +185,7 @@ def weigh(state, *, reject, share=1.0):
         residual = stamps.data - model
         light = np.maximum(model - problem.sky[:, None, None], 0)
     variance = stamps.base + stamps.slope * light
-    if residual is not None:
+    if residual is not None and share is not None:
         state.accuracy = share * _accuracy(residual, light, variance,
                                            problem)
     variance = variance + (state.accuracy * light) ** 2
@@ -370,7 +371,8 @@ def _adapt(state, workers, reject):
     state.prior = state.prior.adapted(
         state.coefficients, state.equations.matrix,
         _groups(state.coefficients, state.problem.form.kinds))
-    weigh(state, reject=reject)
+    # A higher error would mean less weight for the cores, and so on upwards.
+    weigh(state, reject=reject, share=None)
     advance(state, workers, tolerance=0.01, max_steps=10)
 
 

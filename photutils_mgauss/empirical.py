@@ -1,7 +1,7 @@
 r"""
 An empirical PSF: pixels, oversampled, that change over the detector.
 
-On top of a mixture field of few Gaussians stands a correction of cubic
+On top of a mixture field stands a correction of cubic
 B-splines on a lattice finer than the pixels, whose coefficients are
 polynomials of detector position,
 
@@ -81,7 +81,7 @@ class EmpiricalPSF:
 
     @classmethod
     def from_stars(cls, data, stars, *, error=None, mask=None, degree=3,
-                   oversampling=2, radius=10, n_components=3, executor=None):
+                   oversampling=2, radius=10, n_components=5, executor=None):
         """
         Measure the PSF from the stars of one or more exposures.
 

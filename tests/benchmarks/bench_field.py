@@ -145,6 +145,7 @@ def run_scene(path, options):
     test = test_stars(meta, truth, stars)
     grid = field.to_grid((30, 30))
     print_shapes('field', grid, truth_psf)
+    print_profiles('field', grid, truth_psf)
     mag = np.asarray(test['mag'])
     rows = []
     for name, fitted in [
@@ -183,6 +184,37 @@ def print_shapes(label, psf, truth_psf):
           flush=True)
 
 
+def print_profiles(label, psf, truth_psf):
+    """Print how far a PSF's samples are from the truth, shifted upon it."""
+    steps = np.arange(-20, 21) / 2
+    places = np.linspace(0, truth_psf.chip - 1, 6)
+    deviations = [deviation(psf, truth_psf, steps, x, y)
+                  for x in places for y in places]
+    print(f'  {label}: deviation from the true profile, median over the '
+          f'detector: {1000 * np.median(deviations):.2f} thousandths of the '
+          'peak', flush=True)
+
+
+def deviation(psf, truth_psf, steps, x, y):
+    """Return the RMS over 7 x 7 pixels in shares of the peak."""
+    from scipy.interpolate import RectBivariateSpline
+    truth = RectBivariateSpline(steps, steps, truth_psf.epsf(x, y, 2, 41))
+    inner = steps[6:-6]
+    dx, dy = np.meshgrid(inner, inner)
+    model = (psf.mixture_at(x, y).evaluate(dx, dy)
+             if hasattr(psf, 'mixture_at') else
+             psf.evaluate((x + dx).ravel(), (y + dy).ravel(), 1, x,
+                          y).reshape(dx.shape))
+    shift = np.zeros(2)
+    for _ in range(8):
+        design = np.stack([truth.ev(dy - shift[1], dx - shift[0], dx=i, dy=j)
+                           .ravel() for i, j in ((0, 0), (0, 1), (1, 0))], 1)
+        found = np.linalg.lstsq(design, model.ravel())[0]
+        shift -= found[1:] / found[0]
+    residual = model.ravel() - design @ found
+    return np.sqrt(np.mean(residual**2)) / (found[0] * truth.ev(0, 0))
+
+
 def peers(path, meta, images, stars, test, truth_psf, options):
     """Yield name and fits of the peers asked for."""
     chosen = stars[stars['selected']]
@@ -190,6 +222,7 @@ def peers(path, meta, images, stars, test, truth_psf, options):
     for name in options.peers:
         psf = make_peer(name, path, meta, images, chosen)
         print_shapes(name, psf, truth_psf)
+        print_profiles(name, psf, truth_psf)
         yield name, fit_with_photutils(psf, data, error, test)
         if name != 'epsf':
             chain = GriddedMixturePSF.from_gridded_psf(psf, 3, radius=7)
