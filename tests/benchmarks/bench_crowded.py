@@ -21,7 +21,9 @@ IterativePSFPhotometry, which is slow.
 
 Differences of centring conventions, smooth over the field, are taken out of
 every list with a cubic fitted on bright stars. The bound is that of the
-star alone, with our PSF and the true variance.
+star alone; it is read from ``bound.npy`` (x and y of each true star, with the
+true PSF) or, without that file, made with our PSF, which is up to 10 %
+smaller.
 """
 import argparse
 import multiprocessing
