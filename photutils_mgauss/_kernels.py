@@ -1816,6 +1816,14 @@ _LONGEST = 1.0
 # a fraction of the flux.
 _STEP_TOLERANCE = 1e-6
 
+# What fraction of the fall of chi2 that the normal equations promise a step
+# should bring: below the first damping grows, above the second it falls.
+_POOR_GAIN = 0.25
+_FAIR_GAIN = 0.75
+
+# The least factor by which steps are taken to get shorter.
+_LEAST_RATE = 0.03
+
 
 # The PSF of a star and its derivatives by position are summed in a tile, one
 # flat array: for each pixel column _LANES values of the PSF, as many of its
@@ -2275,6 +2283,27 @@ def _step_size(step, parameters, matrix, n):
 
 
 @_jit
+def _undamp(step, matrix, gradient, frozen, size):
+    """Lengthen a damped step to what each parameter alone would go."""
+    for a in range(size):
+        if not frozen[a]:
+            step[a] = max(abs(step[a]), abs(gradient[a]) / matrix[a, a])
+
+
+@_jit
+def _remainder(length, last):
+    """
+    Return how far the minimum is expected to be after a step.
+
+    Convergence is linear at the worst, each step shorter than the last one by
+    the same factor. A first step, with a last one of 0, says nothing of it,
+    and early steps make it look better than it will be.
+    """
+    rate = max(length / last, _LEAST_RATE) if last > 0 else 0.5
+    return length * (rate / (1 - rate) if rate < 0.9 else 10.0)
+
+
+@_jit
 def _take_step(parameters, step, lower, upper, n, size, trial):
     """Put the bounded end of the step into trial, the actual into step."""
     for s in range(n):
@@ -2300,6 +2329,21 @@ def _expected(step, matrix, gradient, size):
 
 
 @_jit
+def _next_damping(damping, gain):
+    """
+    Return the damping after a step that brought gain of what it promised.
+
+    A faint star needs some even at its minimum, where the curvature that the
+    normal matrix leaves out makes undamped steps overshoot.
+    """
+    if gain < _POOR_GAIN:
+        return max(4 * damping, 1e-2)
+    if gain < _FAIR_GAIN:
+        return damping
+    return damping / 10 if damping > 1e-4 else 0.0
+
+
+@_jit
 def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
               limits, max_iterations, chi2):
     """
@@ -2318,7 +2362,7 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
     best = chi2[1]
     floor = 1e-24 * best
     damping = 0.0
-    last = 1.0
+    last = 0.0
     for iteration in range(max_iterations):
         _freeze(parameters, lower, upper, old[3], fixed, size, frozen)
         if not _factorize(old[2], frozen, damping, size, steepest, scale,
@@ -2331,32 +2375,32 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
             step[a] = 0.0 if frozen[a] else old[3][a]
         _solve(factor, scale, size, step)
         _take_step(parameters, step, lower, upper, n, size, trial)
-        length = _step_size(step, parameters, old[2], n)
         expected = _expected(step, old[2], old[3], size)
+        short = _step_size(step, parameters, old[2], n)
+        if damping > 0:
+            _undamp(step, old[2], old[3], frozen, size)
+        length = _step_size(step, parameters, old[2], n)
         _normal_equations(trial, n, fit_sky, pixels, psf, scratch, old, new,
                           chi2)
         if not chi2[0] <= best * (1 + 1e-12) + floor:
-            if length < 1e-3 * _STEP_TOLERANCE or damping > 1e12:
+            if short < 1e-3 * _STEP_TOLERANCE or damping > 1e12:
                 return _STALLED, iteration + 2
             damping = max(10 * damping, 1e-3)
-            last = 1.0
+            last = 0.0
             continue
-        poor = expected > 1e-9 * best and best - chi2[0] < 0.25 * expected
+        # Of a smaller fall nothing is left after rounding: keep the damping.
+        gain = ((best - chi2[0]) / expected if expected > 1e-9 * best
+                else _POOR_GAIN)
         parameters[:size] = trial[:size]
         best = chi2[1]
         for source, target in ((new[0], old[0]), (new[1], old[1])):
             target[:n] = source[:n]
         old[2][:size, :size] = new[2][:size, :size]
         old[3][:size] = new[3][:size]
-        # Convergence is linear at the worst: the next step is expected to
-        # be shorter than this one by the factor this one was.
-        if damping == 0 and length * min(1.0, length / last) < _STEP_TOLERANCE:
+        if _remainder(length, last) < _STEP_TOLERANCE:
             return _CONVERGED, iteration + 2
         last = length
-        if poor:
-            damping = max(4 * damping, 1e-2)
-        else:
-            damping = damping / 10 if damping > 1e-4 else 0.0
+        damping = _next_damping(damping, gain)
     return _NOT_CONVERGED, max_iterations + 1
 
 
@@ -2574,19 +2618,6 @@ _TWO_PI = 2 * np.pi
 
 
 @_jit
-def shape_rows(shapes, rows):
-    """Put the rows that other kernels take into rows (K, 6)."""
-    for k in range(shapes.shape[0]):
-        a, mx, my, log_p, s, log_q = shapes[k]
-        rows[k, 0] = exp(a + log_p + log_q) / _TWO_PI
-        rows[k, 1] = mx
-        rows[k, 2] = my
-        rows[k, 3] = exp(2 * log_p)
-        rows[k, 4] = s
-        rows[k, 5] = exp(2 * log_q)
-
-
-@_jit
 def _design(x, y, rows, sources, n_sources, first, row):
     """
     Put derivatives of a pixel into row and return the model.
@@ -2763,7 +2794,7 @@ def _shift_sources(sources, n_sources, sky, fit_sky, step):
 
 
 @_jit
-def field_normal(stamps, weights, corners, basis, coefficients, sources,
+def field_normal(stamps, weights, corners, basis, rows, jacobians, sources,
                  anchors, hold, n_sources, sky, fit_sky, used, n_steps,
                  normal, total, gradient, chi2):
     """
@@ -2774,27 +2805,25 @@ def field_normal(stamps, weights, corners, basis, coefficients, sources,
     chi2 (n,) and gradient are those after it.
 
     stamps, weights (n, s, s); corners (n, 2), the pixel (x, y) of each
-    stamp's first; basis (n, T); coefficients (T, K, 6); sources, anchors,
-    hold (n, M, 3); n_sources (n,); sky (n,) with fit_sky; used (n,). normal
-    is scratch (D, D) with D = 3 M + 6 K - 1. total (P T, P T), upper
-    triangle, and gradient (P T,) order unknowns by shape, then term, with
-    P = 6 K - 3.
+    stamp's first; basis (n, T); rows (n, K, 6), the PSF of each star;
+    jacobians (n, 6 K - 3, P), the derivatives of its shapes by the P numbers
+    that are polynomials, or (0, 0, 0) if they are the shapes themselves;
+    sources, anchors, hold (n, M, 3); n_sources (n,); sky (n,) with fit_sky;
+    used (n,). normal is scratch (D, D) with D = 3 M + 6 K - 1. total
+    (P T, P T), upper triangle, and gradient (P T,) order unknowns by number,
+    then term.
     """
-    k = coefficients.shape[1]
-    shapes = np.empty((k, 6))
-    rows = np.empty((k, 6))
     block = np.empty((4, normal.shape[0]))
     step = np.empty(normal.shape[0])
     spread = np.empty(gradient.size)
+    condensed = np.empty((jacobians.shape[2], jacobians.shape[2] + 1))
     for star in range(stamps.shape[0]):
-        _shapes_at(basis[star], coefficients, shapes)
-        shape_rows(shapes, rows)
         left, bottom = corners[star]
         own = 3 * n_sources[star] + fit_sky
         for i in range(n_steps):
             last = used[star] and i == n_steps - 1
             size = _accumulate(
-                stamps[star], weights[star], left, bottom, rows,
+                stamps[star], weights[star], left, bottom, rows[star],
                 sources[star], n_sources[star], sky[star], fit_sky, last,
                 block, normal)
             _hold_neighbours(sources[star], anchors[star], n_sources[star],
@@ -2804,19 +2833,34 @@ def field_normal(stamps, weights, corners, basis, coefficients, sources,
             sky[star] = _shift_sources(sources[star], n_sources[star],
                                        sky[star], fit_sky, step)
         chi2[star] = normal[size - 1, size - 1]
-        if used[star]:
+        if not used[star]:
+            continue
+        if jacobians.size:
+            _condense(normal, own, size, jacobians[star], condensed)
+            _spread(condensed, 0, condensed.shape[1], basis[star], spread,
+                    total, gradient)
+        else:
             _spread(normal, own, size, basis[star], spread, total, gradient)
 
 
 @_jit
-def _shapes_at(basis, coefficients, shapes):
-    """Evaluate the polynomials, coefficients (T, K, 6), into (K, 6)."""
-    shapes[:] = 0.0
-    for t in range(basis.size):
-        if basis[t] != 0:
-            for k in range(shapes.shape[0]):
-                for i in range(6):
-                    shapes[k, i] += basis[t] * coefficients[t, k, i]
+def _condense(normal, own, size, jacobian, out):
+    """Put J^T A J and J^T b into out (P, P + 1), upper triangle."""
+    n, p = jacobian.shape
+    out[:] = 0.0
+    line = np.empty(p + 1)
+    for i in range(n):
+        line[:] = 0.0
+        for j in range(n):
+            a = normal[own + min(i, j), own + max(i, j)]
+            for m in range(p):
+                line[m] += a * jacobian[j, m]
+        line[p] = normal[own + i, size - 1]
+        for k in range(p):
+            share = jacobian[i, k]
+            if share != 0:
+                for m in range(k, p + 1):
+                    out[k, m] += share * line[m]
 
 
 @_jit
@@ -2838,19 +2882,14 @@ def _spread(normal, own, size, basis, spread, total, gradient):
 
 
 @_jit
-def field_model(corners, basis, coefficients, sources, n_sources, sky, out):
+def field_model(corners, rows, sources, n_sources, sky, out):
     """Put model stamps of n stars, neighbours and sky included, into out."""
-    k = coefficients.shape[1]
-    shapes = np.empty((k, 6))
-    rows = np.empty((k, 6))
     for star in range(out.shape[0]):
-        _shapes_at(basis[star], coefficients, shapes)
-        shape_rows(shapes, rows)
         left, bottom = corners[star]
         out[star] = sky[star]
         for j in range(n_sources[star]):
             x, y, flux = sources[star, j]
-            render(rows, x - left, y - bottom, flux, False, out[star])
+            render(rows[star], x - left, y - bottom, flux, False, out[star])
 
 
 # Crowded fields: all stars of an image together. Star i is fitted on a square

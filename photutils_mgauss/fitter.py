@@ -28,6 +28,14 @@ _MESSAGES = {
 # Of the expected next step, see _State.length.
 _TOLERANCE = 1e-6
 
+# What fraction of the fall of chi2 that the normal equations promise a step
+# should bring: below the first damping grows, above the second it falls.
+_POOR_GAIN = 0.25
+_FAIR_GAIN = 0.75
+
+# The least factor by which steps are taken to get shorter.
+_LEAST_RATE = 0.03
+
 # Matrices scaled to a diagonal of one whose Cholesky factor has a smaller
 # square than this on its diagonal are taken for singular.
 _SINGULAR = 1e-14
@@ -291,33 +299,72 @@ def _minimize(problem, max_steps):
     values = np.clip(problem.start[problem.free], problem.lower,
                      problem.upper)
     state = problem.evaluate(values)
-    damping, last, steepest = 0.0, 1.0, np.zeros(values.size)
+    damping, last, steepest = 0.0, 0.0, np.zeros(values.size)
     for n in range(max_steps):
         steepest = np.maximum(steepest, np.diag(state.matrix))
         step = _bounded_step(problem, state, damping * steepest)
         if step is None:
             damping = max(10 * damping, 1e-6)
             continue
-        length = state.length(step)
         new = problem.evaluate(state.values + step)
         if not new.chi2 <= state.chi2 * (1 + 1e-12):
-            if length < 1e-3 * _TOLERANCE or damping > 1e12:
+            if state.length(step) < 1e-3 * _TOLERANCE or damping > 1e12:
                 return state, 2, n + 2
-            damping, last = max(10 * damping, 1e-3), 1.0
+            damping, last = max(10 * damping, 1e-3), 0.0
             continue
-        expected = step @ (2 * state.gradient - state.matrix @ step)
-        poor = (expected > 1e-9 * state.chi2
-                and state.chi2 - new.chi2 < 0.25 * expected)
+        length = state.length(_undamped(problem, state, step, damping))
+        gain = _gain(state, new, step)
         state = new
-        # Convergence is linear at the worst, see the next step's length.
-        if damping == 0 and length * min(1.0, length / last) < _TOLERANCE:
+        if _remainder(length, last) < _TOLERANCE:
             return state, 3, n + 2
-        last = length
-        if poor:
-            damping = max(4 * damping, 1e-2)
-        else:
-            damping = damping / 10 if damping > 1e-4 else 0.0
+        last, damping = length, _next_damping(damping, gain)
     return state, 0, max_steps + 1
+
+
+def _gain(state, new, step):
+    """Return what a step brought over what the normal equations promised."""
+    expected = step @ (2 * state.gradient - state.matrix @ step)
+    if expected > 1e-9 * state.chi2:
+        return (state.chi2 - new.chi2) / expected
+    # Of a smaller fall nothing is left after rounding: keep the damping.
+    return _POOR_GAIN
+
+
+def _next_damping(damping, gain):
+    # A faint star needs some even at its minimum, where the curvature that
+    # the normal matrix leaves out makes undamped steps overshoot.
+    if gain < _POOR_GAIN:
+        return max(4 * damping, 1e-2)
+    if gain < _FAIR_GAIN:
+        return damping
+    return damping / 10 if damping > 1e-4 else 0.0
+
+
+def _remainder(length, last):
+    """
+    Return how far the minimum is expected to be after a step.
+
+    Convergence is linear at the worst, each step shorter than the last one by
+    the same factor. A first step, with a last one of 0, says nothing of it,
+    and early steps make it look better than it will be.
+    """
+    rate = max(length / last, _LEAST_RATE) if last > 0 else 0.5
+    return length * (rate / (1 - rate) if rate < 0.9 else 10)
+
+
+def _undamped(problem, state, step, damping):
+    """Lengthen a damped step to what each parameter alone would go."""
+    if damping == 0:
+        return step
+    alone = np.abs(state.gradient) / state.scale**2
+    return np.where(_presses(problem, state), step,
+                    np.maximum(np.abs(step), alone))
+
+
+def _presses(problem, state):
+    """Return which parameters a bound keeps from moving."""
+    return ((state.values <= problem.lower) & (state.gradient < 0)
+            | (state.values >= problem.upper) & (state.gradient > 0))
 
 
 def _bounded_step(problem, state, damping):
@@ -328,9 +375,7 @@ def _bounded_step(problem, state, damping):
     the largest diagonal so far: as a star gets faint its position must not
     become free to run away.
     """
-    low = (state.values <= problem.lower) & (state.gradient < 0)
-    high = (state.values >= problem.upper) & (state.gradient > 0)
-    moves = ~(low | high) & (np.diag(state.matrix) > 0)
+    moves = ~_presses(problem, state) & (np.diag(state.matrix) > 0)
     step = np.zeros(state.values.size)
     if moves.any():
         scale = state.scale[moves]

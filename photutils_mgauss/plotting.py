@@ -6,6 +6,7 @@ Colours are those of Okabe and Ito, which the colour-blind can tell apart.
 import numpy as np
 from astropy.stats import mad_std
 
+from photutils_mgauss._plot_field import plot_field
 from photutils_mgauss.shapes import adaptive_moments
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     'plot_ellipses',
     'plot_error_curve',
     'plot_errors_by_epochs',
+    'plot_field',
     'plot_model_graph',
     'plot_motion_errors',
     'plot_node_map',

@@ -1,5 +1,6 @@
 """Laws of the fast photometry; the oracle is photutils itself."""
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -362,6 +363,21 @@ def test_the_fitter_serves_photutils_in_groups(grid, rng):
     ours = PSFPhotometry(grid, (9, 9), fitter=MixtureFitter(),
                          **kwargs)(data, **call)
     check_same(theirs, ours)
+
+
+@pytest.mark.parametrize('photometry', [
+    MixturePSFPhotometry,
+    partial(PSFPhotometry, fitter=MixtureFitter())])
+def test_faint_stars_converge_too(grid, rng, photometry):
+    # At a signal to noise of four the curvature of the residuals is as large
+    # as that of the model, and undamped steps overshoot.
+    x, y, _ = isolated(rng)
+    flux = np.full(x.size, 180.0)
+    data, error = draw(grid, x, y, flux)
+    start = QTable({'x': x, 'y': y, 'flux': flux})
+    table = photometry(grid, (9, 9))(data, error=error, init_params=start)
+    assert 3 < np.median(table['flux_fit'] / table['flux_err']) < 6
+    assert not (table['flags'] & 8).any()
 
 
 @pytest.mark.parametrize('weighted', [False, True])

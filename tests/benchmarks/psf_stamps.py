@@ -33,9 +33,11 @@ def field_coefficients(n_side, rng):
     return c.reshape(8, -1).T
 
 
-def make_stamps(n_side=30, *, seed=1):
+def make_stamps(n_side=30, *, seed=1, oversampling=2):
     """
-    Return (n_side^2, 30, 30) ePSFs on a grid of the field, native sum 1.
+    Return ePSFs on a grid of the field, native sum 1.
+
+    They are (n_side^2, 30, 30) or, with an oversampling of 4, twice as large.
 
     The middle of a stamp is between its pixels, and it holds about 98 % of
     the flux.
@@ -52,20 +54,30 @@ def make_stamps(n_side=30, *, seed=1):
     blur = (np.exp(-2 * (np.pi * SMEARING)**2 * (fx**2 + fy**2))
             * np.sinc(fx * PIXEL) * np.sinc(fy * PIXEL))
     rng = np.random.default_rng(seed)
-    return np.array([_stamp(np.tensordot(c, modes, 1), inside, kernels, blur)
+    cut = {2: _every_second, 4: _middle}[oversampling]
+    return np.array([cut(_image(np.tensordot(c, modes, 1), inside, kernels,
+                                blur))
                      for c in field_coefficients(n_side, rng)])
 
 
-def _stamp(path, inside, kernels, blur):
+def _image(path, inside, kernels, blur):
     total = 0
     for kernel, wavelength in zip(kernels, WAVELENGTHS, strict=True):
         field = inside * np.exp(2j * np.pi * path / wavelength)
         total = total + np.abs(kernel @ field @ kernel.T)**2
     total = np.fft.ifft2(np.fft.fft2(total) * blur).real
-    total *= 16 / total.sum()  # per native pixel of 4 x 4 samples
+    return total * 16 / total.sum()  # per native pixel of 4 x 4 samples
+
+
+def _middle(image):
+    cut = slice(N_FINE // 2 - 30, N_FINE // 2 + 30)
+    return image[cut, cut]
+
+
+def _every_second(image):
     # Every second sample, between which the middle lies.
     first = N_FINE // 2 - 30
-    middle = (total[first:first + 60] + total[first + 1:first + 61]) / 2
+    middle = (image[first:first + 60] + image[first + 1:first + 61]) / 2
     middle = (middle[:, first:first + 60] + middle[:, first + 1:first + 61]
               ) / 2
     return middle[::2, ::2]
