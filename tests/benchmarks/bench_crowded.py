@@ -10,8 +10,8 @@ exposure, never the true one, and is that of all programs but SExtractor
 
 Parts: ``peers`` prints completeness, false stars, RMS/CRLB, flux bias and
 pulls of each program, and median position errors beside ours on each one's
-list and on the stars of both; ``given`` the same with all programs on
-SExtractor's list; ``curve`` completeness over false stars at 24-25 mag;
+list and on the stars of both; ``given`` the same with all programs that can
+on SExtractor's list (crowdsource moves no stars of a given list); ``curve`` completeness over false stars at 24-25 mag;
 ``area`` CPU seconds and memory of growing images, the scene repeated where
 it is smaller. SExtractor, PSFEx and IRAF run if they are installed,
 crowdsource with ``--crowdsource PYTHON``, an interpreter that has it and the
@@ -176,10 +176,6 @@ def given_part(bench):
         lists['ALLSTAR'] = peers.timed(peers.daophot, scene,
                                        bench.folder / 'daophot', bench.sky,
                                        start)
-    if bench.args.crowdsource:
-        lists['crowdsource'] = peers.crowdsource(
-            bench.args.crowdsource, scene, bench.psf, bench.folder / 'forced',
-            bench.sky, start)
     for name, other in lists.items():
         compare(name, scene, table, other)
 
