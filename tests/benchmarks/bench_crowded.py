@@ -11,7 +11,8 @@ exposure, never the true one, and is that of all programs but SExtractor
 Parts: ``peers`` prints completeness, false stars, RMS/CRLB, flux bias and
 pulls of each program, and median position errors beside ours on each one's
 list and on the stars of both; ``given`` the same with all programs that can
-on SExtractor's list (crowdsource moves no stars of a given list); ``curve`` completeness over false stars at 24-25 mag;
+on SExtractor's list (crowdsource moves no stars of a given list); ``curve``
+completeness over false stars at 24-25 mag;
 ``area`` CPU seconds and memory of growing images, the scene repeated where
 it is smaller. SExtractor, PSFEx and IRAF run if they are installed,
 crowdsource with ``--crowdsource PYTHON``, an interpreter that has it and the
