@@ -19,6 +19,7 @@ from photutils_mgauss import (
     _kernels,
     inject_and_recover,
 )
+from photutils_mgauss._crowded_sky import Mesh
 from photutils_mgauss._crowded_stars import Neighbours, Stars
 from photutils_mgauss._crowded_tile import Tile, TileJob, TileOptions
 from photutils_mgauss._local_psf import LocalPSF
@@ -131,6 +132,48 @@ def test_gauss_newton_finds_a_noiseless_blend_again():
     assert_allclose(tile.stars.x, x, atol=2e-3)
     assert_allclose(tile.stars.flux, flux, rtol=2e-3)
     assert_allclose(tile.level, 5, atol=0.02)
+
+
+def test_the_background_of_a_plane_is_that_plane():
+    mesh = Mesh((100, 130), (32, 64), 40)
+    y, x = np.indices((100, 130))
+    node_y, node_x = np.meshgrid(mesh.y, mesh.x, indexing='ij')
+    image = mesh.image((3 + 0.1 * node_x - 0.2 * node_y).ravel())
+    inside = ((x >= mesh.x[0]) & (x <= mesh.x[-1]) & (y >= mesh.y[0])
+              & (y <= mesh.y[-1]))
+    assert_allclose(image[inside], (3 + 0.1 * x - 0.2 * y)[inside],
+                    atol=1e-12)
+
+
+def test_every_pixel_belongs_to_its_nearest_node():
+    mesh = Mesh((100, 130), (32, 64), 40)
+    y, x = np.indices((100, 130))
+    node_y, node_x = np.meshgrid(mesh.y, mesh.x, indexing='ij')
+    _, nearest_node = cKDTree(np.column_stack(
+        [node_x.ravel(), node_y.ravel() + 1e-6])).query(
+            np.column_stack([x.ravel() + 1e-3, y.ravel() + 2e-3]))
+    image = np.random.default_rng(1).normal(size=x.shape)
+    want = np.bincount(nearest_node, image.ravel(), node_x.size)
+    assert_allclose(mesh.sums(image), want, atol=1e-10)
+
+
+def test_wings_are_those_of_the_exact_gaussian(rng):
+    y, x = np.indices((40, 40))
+    for _ in range(60):
+        (a, b), rho = rng.uniform(0.35, 8, 2), rng.uniform(-0.9, 0.9)
+        covariance = np.array([[a * a, rho * a * b], [rho * a * b, b * b]])
+        det = np.linalg.det(covariance)
+        row = np.array([3.0, 0.2, -0.1, covariance[1, 1] / det,
+                        covariance[0, 1] / covariance[1, 1],
+                        1 / covariance[1, 1]])
+        cx, cy = rng.uniform(-6, 46, 2)
+        image = np.zeros((40, 40))
+        _kernels._add_wings(row[None], 1.0, cx, cy, False, 1e-6,
+                            np.empty((4, 40)), np.empty((3, 9)), image)
+        offset = np.stack([x - cx - 0.2, y - cy + 0.1], axis=-1)
+        exact = 3 * np.exp(-0.5 * np.einsum(
+            '...i,ij,...j', offset, np.linalg.inv(covariance), offset))
+        assert_allclose(image, exact, atol=1.1e-6)
 
 
 def test_neighbours_are_listed_both_ways():

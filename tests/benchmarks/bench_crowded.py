@@ -10,8 +10,9 @@ exposure, never the true one, and is that of all programs but SExtractor
 
 Parts: ``peers`` prints completeness, false stars, RMS/CRLB, flux bias and
 pulls of each program, and median position errors beside ours on each one's
-list and on the stars of both; ``given`` the same with all programs on
-SExtractor's list; ``curve`` completeness over false stars at 24-25 mag;
+list and on the stars of both; ``given`` the same with all programs that can
+on SExtractor's list (crowdsource moves no stars of a given list); ``curve``
+completeness over false stars at 24-25 mag;
 ``area`` CPU seconds and memory of growing images, the scene repeated where
 it is smaller. SExtractor, PSFEx and IRAF run if they are installed,
 crowdsource with ``--crowdsource PYTHON``, an interpreter that has it and the
@@ -21,7 +22,9 @@ IterativePSFPhotometry, which is slow.
 
 Differences of centring conventions, smooth over the field, are taken out of
 every list with a cubic fitted on bright stars. The bound is that of the
-star alone, with our PSF and the true variance.
+star alone; it is read from ``bound.npy`` (x and y of each true star, with the
+true PSF) or, without that file, made with our PSF, which is up to 10 %
+smaller.
 """
 import argparse
 import multiprocessing
@@ -174,10 +177,6 @@ def given_part(bench):
         lists['ALLSTAR'] = peers.timed(peers.daophot, scene,
                                        bench.folder / 'daophot', bench.sky,
                                        start)
-    if bench.args.crowdsource:
-        lists['crowdsource'] = peers.crowdsource(
-            bench.args.crowdsource, scene, bench.psf, bench.folder / 'forced',
-            bench.sky, start)
     for name, other in lists.items():
         compare(name, scene, table, other)
 

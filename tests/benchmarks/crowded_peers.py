@@ -125,17 +125,16 @@ def _plain(x, y, flux, **more):
 
 # crowdsource.
 
-def crowdsource(interpreter, scene, psf, folder, sky, start=None):
+def crowdsource(interpreter, scene, psf, folder, sky):
     """Run crowdsource in its own interpreter; seconds are of the fit."""
     folder.mkdir(parents=True, exist_ok=True)
     images = scene.images
-    more = {} if start is None else {c: np.asarray(start[c]) for c in 'xy'}
     np.savez(folder / 'in.npz', data=images['sci'] - sky,
              error=images['err'], mask=images['mask'],
              weights=[m.weights for m in psf.mixtures],
              means=[m.means for m in psf.mixtures],
              covariances=[m.covariances for m in psf.mixtures],
-             grid=psf.grid_xypos, **more)
+             grid=psf.grid_xypos)
     home = Path(__file__).resolve().parents[2]
     environment = {**os.environ, 'PYTHONPATH': str(home)}
     run([interpreter, Path(__file__).with_name('run_crowdsource.py'),

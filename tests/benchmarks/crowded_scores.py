@@ -42,6 +42,8 @@ class Scene:
                   for name, image in images.items()}
         meta = json.loads((folder / 'meta.json').read_text())
         truth = Table.read(folder / 'truth.ecsv')
+        if (folder / 'bound.npy').exists():
+            truth['bound'] = np.load(folder / 'bound.npy')
         n = len(images['sci'])
         truth = truth[(truth['x'] > -0.5) & (truth['x'] < n - 0.5)
                       & (truth['y'] > -0.5) & (truth['y'] < n - 0.5)]
@@ -58,7 +60,10 @@ class Scene:
 
     def bounded(self, psf):
         """Return the scene with the bound of each star's x and y."""
-        bound = bounds(psf, self.truth, self.images['vartrue'])
+        if 'bound' in self.truth.colnames:
+            bound = np.asarray(self.truth['bound'])
+        else:
+            bound = bounds(psf, self.truth, self.images['vartrue'])
         return Scene(self.images, self.truth, self.origin, self.zero, bound)
 
     def magnitude(self, flux):

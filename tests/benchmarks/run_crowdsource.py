@@ -2,9 +2,9 @@
 Run crowdsource on an image, in an interpreter that has it.
 
 ``python run_crowdsource.py IN.npz OUT.npz``: data (its sky taken off),
-error, mask, and the PSF as weights, means, covariances and grid; x and y, if
-given, are fitted instead of finding stars. The PSF is drawn by this
-package's compiled code, so that little of the time is spent on it.
+error, mask, and the PSF as weights, means, covariances and grid. The PSF is
+drawn by this package's compiled code, so that little of the time is spent on
+it.
 """
 import sys
 import time
@@ -66,14 +66,8 @@ def main(source, target):
     weight = np.where(given['mask'], 0, 1 / given['error'])
     psf(np.zeros(2), np.zeros(2), 19, deriv=True)  # compile
     start = time.process_time()
-    if 'x' in given.files:
-        stars = crowdsource_base.fit_im_force(
-            data, given['y'], given['x'], psf, weight=weight,
-            psfderiv=True)[0]
-    else:
-        stars = crowdsource_base.fit_im(
-            data, psf, weight=weight, psfderiv=True, refit_psf=False,
-            maxstars=4000000)[0]
+    stars = crowdsource_base.fit_im(data, psf, weight=weight, psfderiv=True,
+                                    refit_psf=False, maxstars=4000000)[0]
     seconds = time.process_time() - start
     np.savez(target, x=stars['y'], y=stars['x'], flux=stars['flux'],
              flux_err=stars['dflux'], x_err=stars['dy'], y_err=stars['dx'],
