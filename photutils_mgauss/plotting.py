@@ -683,8 +683,7 @@ def plot_proper_motions(ax, stars):
     `~matplotlib.axes.Axes`
         The same; reference objects are orange.
     """
-    # A file gives the empty words of stars back as missing ones.
-    reference = np.ma.filled(stars['reference'], '') != ''
+    reference = _is_reference(stars)
     for which, colour, label in ((~reference, BLUE, 'stars'),
                                  (reference, ORANGE, 'references')):
         some = stars[which]
@@ -698,6 +697,11 @@ def plot_proper_motions(ax, stars):
     ax.invert_xaxis()
     ax.legend()
     return ax
+
+
+def _is_reference(stars):
+    # A file gives the empty words of stars back as missing ones.
+    return np.ma.filled(stars['reference'], '') != ''
 
 
 def plot_motion_errors(ax, stars, magnitude):
@@ -716,10 +720,13 @@ def plot_motion_errors(ax, stars, magnitude):
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
+        The same. Reference objects, whose errors a catalogue gave, are left
+        out.
     """
+    free = ~_is_reference(stars)
     for name, colour in (('pmra', ORANGE), ('pmdec', BLUE)):
-        ax.plot(magnitude, stars[f'{name}_error'].value, '.', color=colour,
+        ax.plot(np.asarray(magnitude)[free],
+                stars[f'{name}_error'][free].value, '.', color=colour,
                 markersize=3, label=name)
     ax.set(yscale='log', xlabel='magnitude [mag]',
            ylabel=f'error [{stars["pmra"].unit}]')
@@ -745,7 +752,7 @@ def plot_errors_by_epochs(ax, solutions):
         The same.
     """
     counts = [len(solution.epochs) for solution in solutions]
-    measured = [solution.stars[solution.stars['reference'] == '']
+    measured = [solution.stars[~_is_reference(solution.stars)]
                 for solution in solutions]
     for name, colour in (('pmra', ORANGE), ('pmdec', BLUE)):
         medians = [np.nanmedian(stars[f'{name}_error'].value)

@@ -35,7 +35,6 @@ solutions = [fitter.fit([epochs[i] for i in campaign])
 
 figure, axes = plt.subplots(1, 2, figsize=(9.5, 4), layout='constrained')
 stars = solutions[-1].stars
-stars = stars[stars['reference'] == '']  # not the quasars
 magnitude = dict(zip(sources['id'], sources['mag_g'].value, strict=True))
 plot_motion_errors(axes[0], stars,
                    np.array([magnitude[name] for name in stars['id']]))
