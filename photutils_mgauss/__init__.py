@@ -31,6 +31,7 @@ _OWNERS = {
     'PSFAssessment': 'assessment',
     'assess_psf': 'assessment',
     'MixtureField': 'field',
+    'TunedMixtureField': 'tuned_field',
     'fit_mixture_field': 'field',
     'select_psf_stars': 'selection',
     'MultiGaussianPSFModel': 'model',

@@ -157,6 +157,8 @@ def _from_image(options, image, names, i):
     """Return the epoch of an image; write its PSF and catalogue."""
     if image.wcs is None and not options.plane:
         raise ValueError(_no_sky(image.path))
+    if image.time is None:
+        raise ValueError(_no_time(image.path))
     psf, found = psf_command.from_stars(image, options)
     psf_command.write(psf, names.psfs[i], tools.record_of(
         options, input=str(image.path), **found))
@@ -185,28 +187,25 @@ def _wcs_of(options, i, record):
     given = tools.one_each(options.wcs, len(options.inputs), 'wcs')[i]
     if given is not None:
         return read_wcs(given)
-    image = record.get('exposure', {}).get('image')
-    if image is None:
+    exposure = record.get('exposure', {})
+    name = exposure.get('wcs') or exposure.get('image')
+    if name is None:
         return None
-    image = Path(options.inputs[i]).resolve().parent / image
-    if not image.exists():
-        tools.say(options, f'{options.inputs[i]}: its image {image} is not '
-                  'there; the places on the sky are used as they are')
+    file = Path(options.inputs[i]).resolve().parent / name
+    if not file.exists():
+        tools.say(options, f'{options.inputs[i]}: {file} is not there, which '
+                  'has its WCS; the places on the sky are used as they are')
         return None
-    used = record.get('options', {})
-    wcs = used.get('wcs')
-    if wcs and len(used.get('inputs', [])) == 1 and Path(wcs[0]).exists():
-        return read_wcs(wcs[0])
-    return read_image(image, Reading(ext=used.get('ext'))).wcs
+    if exposure.get('wcs'):
+        return read_wcs(file)
+    return read_image(file, Reading(ext=exposure.get('ext'))).wcs
 
 
 def _epoch(options, path, table, wcs, time):
     """Return the `Epoch` of a table, its flagged rows left out."""
     from photutils_mgauss.proper_motion import Epoch
     if time is None and 'time' not in table.colnames:
-        msg = (f'{path}: the time must be known; the header has none, give '
-               '--time')
-        raise ValueError(msg)
+        raise ValueError(_no_time(path))
     table = _usable(table, options.good_flags)
     wcs = None if options.plane else wcs
     if wcs is None and not options.plane:
@@ -242,6 +241,10 @@ def _on_the_sky(path, table):
 def _no_sky(path):
     return (f'{path}: must have a WCS or columns ra and dec, got neither; '
             'give --wcs, or --plane for motions in pixels')
+
+
+def _no_time(path):
+    return f'{path}: the time must be known; its header has none, give --time'
 
 
 def _fit(epochs, options):

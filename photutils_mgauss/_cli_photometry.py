@@ -1,5 +1,6 @@
 """``mgauss photometry``: images and PSFs to catalogues."""
 import os
+from pathlib import Path
 
 from photutils_mgauss import _cli_tools as tools
 
@@ -137,9 +138,11 @@ def _with_sky(table, image):
 
 def exposure(image, name):
     """Return where and when: what motions needs of an image."""
-    time = image.time
+    time, reading = image.time, image.reading
     folder = name.resolve().parent
+    wcs = reading.wcs and os.path.relpath(Path(reading.wcs).resolve(), folder)
     return {'image': os.path.relpath(image.path.resolve(), folder),
+            'ext': reading.ext, 'wcs': wcs,
             'time': None if time is None else _jyear(time)}
 
 

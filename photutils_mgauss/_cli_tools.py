@@ -2,6 +2,7 @@
 import argparse
 import json
 import os
+import re
 import sys
 import warnings
 from contextlib import contextmanager
@@ -188,10 +189,8 @@ def parse_time(text):
     from astropy.time import Time
 
     from photutils_mgauss._parallax import tdb
-    try:
+    if re.fullmatch(r'\d{4}(\.\d*)?', text):
         return tdb(float(text))
-    except ValueError:
-        pass
     try:
         return Time(text, scale='utc')
     except ValueError as error:
@@ -207,13 +206,15 @@ def output_names(inputs, output, ending, suffixes, default):
     takes a single input, or else a folder, in which the files have the names
     of the inputs with ``ending`` and the suffix ``default``.
     """
-    if output is not None and Path(output).suffix in suffixes:
+    is_folder = output is None or output.endswith('/') or Path(
+        output).is_dir()
+    if not is_folder and Path(output).suffix in suffixes:
         if len(inputs) != 1:
             msg = (f'--output must be a folder for {len(inputs)} inputs, got '
                    f'{output}')
             raise ValueError(msg)
         return [Path(output)]
-    if output is not None and Path(output).suffix:
+    if not is_folder and suffixes and Path(output).suffix:
         msg = (f'--output must be a folder or end with '
                f'{" or ".join(suffixes)}, got {output}')
         raise ValueError(msg)

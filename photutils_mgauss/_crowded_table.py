@@ -65,7 +65,7 @@ def tabulate(tile, core):
     with np.errstate(invalid='ignore'):
         error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     count, chi2, deviation, centre, crowding, _ = quality.T
-    node, share = tile._shares()
+    node, share = tile.mesh.shares(s.x, s.y)
     flux = np.maximum(s.flux, 1e-300)
     strength = np.divide(s.flux, error[:, 0], where=error[:, 0] > 0,
                          out=np.zeros(len(s)))

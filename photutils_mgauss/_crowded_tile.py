@@ -20,8 +20,9 @@ from scipy.ndimage import label, maximum_filter
 from scipy.spatial import cKDTree
 
 from photutils_mgauss import _kernels
+from photutils_mgauss._crowded_sky import Mesh
 from photutils_mgauss._crowded_stars import Neighbours, Stars
-from photutils_mgauss._local_psf import MAX_WING, cells
+from photutils_mgauss._local_psf import MAX_WING
 
 # Fit stamps are 7 or 9 pixels wide, 13 for bright stars: almost all of the
 # information on a position lies in the core.
@@ -59,7 +60,7 @@ _SEPARATION = 0.3
 _GRAVE = 0.5
 # Finding starts with the brightest stars.
 _FALLING = (80, 25, 10)
-_FINAL_STEPS = 8
+_FINAL_STEPS = 6
 # Polishing moves no star further than this [pix]: blends that cannot be
 # resolved would run away.
 _ROAM = 0.5
@@ -67,13 +68,13 @@ _ROAM = 0.5
 _REST = 2e-5
 # Pixels further than this from the model take no part in the background.
 _BACKGROUND_CLIP = 4.0
-# How strongly neighbouring nodes are tied, in units of a node's information.
-_TIE = 1e-3
 # Within this distance [pix], stars are too many to be stars if each has less
 # than this many times the PSF's own area, in which half a star's information
 # lies.
 _DENSITY_REACH = 6.0
 _OWN_AREA = 0.7
+# What is known of each star's stamp.
+_FRAME = ('wing', 'width', 'left', 'bottom', 'offset')
 # Groups of bad pixels of up to this many may hide a saturated star.
 _SATURATED_PIXELS = (2, 2000)
 
@@ -132,31 +133,12 @@ class Tile:
         self._make_templates()
 
     def _make_mesh(self):
-        ny, nx = self.data.shape
-        size = self.options.background_size or max(ny, nx)
-        y_0, x_0 = self.origin
-        self.mesh_x = _lattice(x_0, nx, size) - x_0
-        self.mesh_y = _lattice(y_0, ny, size) - y_0
-        self.ties = _ties(self.mesh_y.size, self.mesh_x.size)
-        self.hats = [_hats(n, nodes) for n, nodes in
-                     ((ny, self.mesh_y), (nx, self.mesh_x))]
-        # A node is the mean of the sky over the pixels nearest to it, so that
-        # it depends on nothing further away.
-        self.own = [_owners(n, nodes) for n, nodes in
-                    ((ny, self.mesh_y), (nx, self.mesh_x))]
-        self.level = np.zeros(self.mesh_x.size * self.mesh_y.size)
-        if self.options.background_size:
-            self.level = self._first_level()
-
-    def _first_level(self):
-        """Return a faint percentile around each node: stars hide the sky."""
-        out = np.empty((self.mesh_y.size, self.mesh_x.size))
-        for j, i in np.ndindex(out.shape):
-            part = np.ix_(self.own[0][:, j] > 0, self.own[1][:, i] > 0)
-            seen = self.data[part][self.good[part]]
-            out[j, i] = np.percentile(seen, 20) if seen.size else np.nan
-        known = np.isfinite(out)
-        return np.where(known, out, np.median(out[known])).ravel()
+        size = self.options.background_size
+        self.mesh = Mesh(self.data.shape, self.origin,
+                         size or max(self.data.shape))
+        # Stars hide the sky.
+        self.level = (self.mesh.faint_level(self.data, self.good) if size
+                      else np.zeros(len(self.mesh.ties)))
 
     def _make_templates(self):
         ny, nx = self.data.shape
@@ -170,23 +152,55 @@ class Tile:
 
     def lay_out(self):
         """Choose stamps and wings, list neighbours."""
+        self.wing, self.width, self.left, self.bottom = self._frames(
+            np.arange(len(self.stars)))
+        self.offset, total = _offsets(self.width, 0)
+        self.jets = np.empty((3, total))
+        self.pairs = Neighbours.of(self.stars.x, self.stars.y)
+
+    def _frames(self, chosen):
+        """Return the wings, widths and corners of the chosen stars."""
         s = self.stars
-        flux = np.maximum(s.flux, 1e-300)
-        self.wing = np.clip(
+        flux = np.maximum(s.flux[chosen], 1e-300)
+        wing = np.clip(
             np.searchsorted(-self.profile, -_WING_NOISE * self.noise / flux),
-            _MIN_HALF, MAX_WING).astype(np.int64)
-        bright = s.flux * self.profile[0] > _BRIGHT_FLUX * self.noise
-        half = np.clip(self.wing, _MIN_HALF, np.where(
+            _MIN_HALF, MAX_WING)
+        bright = flux * self.profile[0] > _BRIGHT_FLUX * self.noise
+        half = np.clip(wing, _MIN_HALF, np.where(
             bright, _BRIGHT_HALF, _MAX_HALF))
-        half[s.seeded] = _BRIGHT_HALF + 2
-        self.wing = np.maximum(self.wing, half)
-        self.width = 2 * half + 1
-        self.left = np.rint(s.x).astype(np.int64) - half
-        self.bottom = np.rint(s.y).astype(np.int64) - half
-        ends = np.cumsum(self.width**2)
-        self.offset = np.concatenate([[0], ends])[:-1].astype(np.int64)
-        self.jets = np.empty((3, self.width @ self.width))
-        self.pairs = Neighbours.of(s.x, s.y)
+        half[s.seeded[chosen]] = _BRIGHT_HALF + 2
+        return (np.maximum(wing, half).astype(np.int64), 2 * half + 1,
+                np.rint(s.x[chosen]).astype(np.int64) - half,
+                np.rint(s.y[chosen]).astype(np.int64) - half)
+
+    def admit(self, found):
+        """Add stars; the others stay as they are."""
+        new = np.arange(len(self.stars), len(self.stars) + len(found))
+        self.stars.append(found)
+        frames = self._frames(new)
+        offset, total = _offsets(frames[1], self.jets.shape[1])
+        for name, values in zip(_FRAME, (*frames, offset), strict=True):
+            setattr(self, name, np.concatenate([getattr(self, name),
+                                                values]))
+        self.jets = np.concatenate(
+            [self.jets, np.empty((3, total - self.jets.shape[1]))], axis=1)
+        self._localise_psf()
+        self._draw_stamps(new)
+        self._add_stars(new, -1.0)
+        self._reconnect()
+
+    def dismiss(self, gone):
+        """Take stars away; the others stay as they are."""
+        self._add_stars(np.flatnonzero(gone), 1.0)
+        for name in _FRAME:
+            setattr(self, name, getattr(self, name)[~gone])
+        self.stars.select(~gone)
+        self._reconnect()
+
+    def _reconnect(self):
+        self._weigh()
+        self.pairs = Neighbours.of(self.stars.x, self.stars.y)
+        self.form_equations()
 
     def _place(self):
         return self.left, self.bottom, self.width, self.offset
@@ -224,8 +238,7 @@ class Tile:
 
     def background(self):
         """Return the image of the background."""
-        level = self.level.reshape(self.mesh_y.size, -1)
-        return self.hats[0] @ level @ self.hats[1].T
+        return self.mesh.image(self.level)
 
     def _weigh(self):
         if self.options.gain is not None:
@@ -260,26 +273,26 @@ class Tile:
                                self.matrix, self.gradient, self.reach)
         _kernels.pair_blocks(p.indptr, p.neighbour, p.twin, s.flux, *place,
                              self.weight, self.blocks)
-        information, self.mesh_gradient = self._background_equations()
-        # Nodes without pixels follow their neighbours.
-        tie = _TIE * (self.options.background_size or 1)**2 / self.noise**2
-        self.mesh = np.diag(information) + tie * self.ties
-        self.mesh_gradient -= tie * self.ties @ self.level
+        self._form_background_equations()
 
-    def _background_equations(self):
-        """Return the information on each node, and gradients."""
-        if not self.options.background_size:
+    def _form_background_equations(self):
+        """Form the matrix of the nodes' levels, and the gradient."""
+        if self.options.background_size:
+            # All pixels count for the information: stars are coupled through
+            # all of theirs. Those far from the model say nothing of the sky.
+            weight = np.where(self.weight * self.residual**2
+                              <= _BACKGROUND_CLIP**2, self.weight, 0)
+            sky = weight * (self.residual + self.background())
+            information, seen, total = (
+                self.mesh.sums(image) for image in (self.weight, weight, sky))
+            gradient = total - seen * self.level
+        else:
             self.reach[:] = 0
-            return np.zeros((2, self.level.size))
-        # All pixels count for the information: stars are coupled through all
-        # of theirs. Those far from the model say nothing about the sky.
-        weight = np.where(self.weight * self.residual**2
-                          <= _BACKGROUND_CLIP**2, self.weight, 0)
-        sky = weight * (self.residual + self.background())
-        information, seen, total = (
-            (self.own[0].T @ image @ self.own[1]).ravel()
-            for image in (self.weight, weight, sky))
-        return information, total - seen * self.level
+            information = gradient = np.zeros(self.level.size)
+        # Nodes without pixels follow their neighbours.
+        ties = self.mesh.ties / self.noise**2
+        self.mesh_matrix = np.diag(information) + ties
+        self.mesh_gradient = gradient - ties @ self.level
 
     def refresh(self):
         """Bring everything up to date with the stars."""
@@ -295,8 +308,8 @@ class Tile:
         matrix = self.matrix * (1 + damping * np.eye(3))
         _kernels.solve_joint(
             matrix, self.gradient, p.indptr, p.neighbour, self.blocks,
-            *self._own_node(), self.reach, self.mesh, self.mesh_gradient,
-            _TOLERANCE, _CG_STEPS, step, level_step)
+            *self._own_node(), self.reach, self.mesh_matrix,
+            self.mesh_gradient, _TOLERANCE, _CG_STEPS, step, level_step)
         step[:, 1:] = np.clip(step[:, 1:], -_MAX_MOVE, _MAX_MOVE)
         step[:, 0] = np.clip(step[:, 0], (_LEAST_CHANGE - 1) * s.flux,
                              (_MOST_CHANGE - 1) * s.flux)
@@ -354,20 +367,10 @@ class Tile:
         """Return the shares of a background that is constant in cells."""
         # Only such a one makes, with each node's own mean, a matrix that is
         # positive definite; where steps end does not depend on it.
-        node, share = self._shares()
+        node, share = self.mesh.shares(self.stars.x, self.stars.y)
         own = np.zeros(share.shape)
         own[np.arange(len(own)), share.argmax(axis=1)] = 1
         return node, own
-
-    def _shares(self):
-        """Return each star's four nodes of the background and shares."""
-        s, n = self.stars, self.mesh_x.size
-        column, fx = cells(s.x, self.mesh_x)
-        row, fy = cells(s.y, self.mesh_y)
-        node = (row * n + column)[:, None] + np.array([0, 1, n, n + 1])
-        share = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy,
-                          fx * fy], axis=1)
-        return node, share
 
     def covariances(self):
         """Return covariances with neighbours free, and correlations."""
@@ -382,7 +385,7 @@ class Tile:
     # Finding and leaving out.
 
     def find(self, threshold, found_in):
-        """Add the maxima of significance on the residual; return how many."""
+        """Add the maxima of significance on the residual."""
         significance, flux = self._scores(threshold)
         peak = (significance > threshold) & (
             significance == maximum_filter(significance, 3))
@@ -392,8 +395,7 @@ class Tile:
                       significance=significance[y, x], found_in=found_in,
                       n_rows=self.psf.n_rows)
         found.select(self._apart(found))
-        self.stars.append(found)
-        return len(found)
+        self.admit(found)
 
     def _scores(self, threshold):
         ny, nx = self.data.shape
@@ -455,7 +457,7 @@ class Tile:
         weak |= (s.x < -1) | (s.y < -1) | (s.x > nx) | (s.y > ny)
         gone = np.flatnonzero(weak)
         places = np.column_stack([s.x[gone], s.y[gone]])
-        s.select(~weak)
+        self.dismiss(weak)
         return places
 
     def seed_saturated(self):
@@ -550,25 +552,21 @@ def _find_all(tile):
     for number, threshold in enumerate(_FALLING):
         if threshold > options.threshold:
             tile.find(threshold, number)
-            tile.refresh()
             tile.step(0.05)
             if number == 0:
                 # Later, errors of the PSF are hidden by false companions.
                 tile.step(0.05)
                 tile.widths = _size_differences(tile)
             tile.leave_out(1.0)
-            tile.refresh()
     for number in range(options.max_rounds):
         tile.find(options.threshold, len(_FALLING) + number)
-        tile.refresh()
         tile.step(0.05)
-        tile.step(0.05)
-        if number > 1:
+        if number < 2:
+            tile.leave_out(0.7 * options.keep)
+        else:
+            tile.step(0.05)
             gone = tile.leave_out(options.keep)
             tile.graves = np.concatenate([tile.graves, gone])
-        else:
-            tile.leave_out(0.7 * options.keep)
-        tile.refresh()
 
 
 def _settle(tile):
@@ -583,44 +581,11 @@ def _settle(tile):
     tile.refresh()
 
 
-def _lattice(first, size, spacing):
-    """Return the multiples of spacing that are nearest to a pixel."""
-    low = np.floor(first / spacing + 0.5)
-    high = max(np.floor((first + size - 1) / spacing + 0.5), low + 1)
-    return np.arange(low, high + 1) * float(spacing)
-
-
-def _hats(size, nodes):
-    """Return the share (size, n) of each node in each pixel of an axis."""
-    cell, passed = cells(np.arange(float(size)), nodes)
-    out = np.zeros((size, nodes.size))
-    pixel = np.arange(size)
-    out[pixel, cell] = 1 - passed
-    out[pixel, cell + 1] = passed
-    return out
-
-
-def _owners(size, nodes):
-    """Return a matrix (size, n) of which node is nearest to each pixel."""
-    middle = (nodes[1:] + nodes[:-1]) / 2
-    out = np.zeros((size, nodes.size))
-    pixel = np.arange(size)
-    out[pixel, np.searchsorted(middle, pixel, side='right')] = 1
-    return out
-
-
-def _ties(ny, nx):
-    """Return the matrix of the sum of squared differences of neighbours."""
-    number = np.arange(ny * nx).reshape(ny, nx)
-    out = np.zeros((ny * nx, ny * nx))
-    pairs = ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1]))
-    for after, before in pairs:
-        a, b = after.ravel(), before.ravel()
-        np.add.at(out, (a, a), 1)
-        np.add.at(out, (b, b), 1)
-        out[a, b] -= 1
-        out[b, a] -= 1
-    return out
+def _offsets(width, start):
+    """Return where stamps of these widths begin, and where they end."""
+    ends = start + np.cumsum(width**2)
+    return (np.concatenate([[start], ends])[:-1].astype(np.int64),
+            int(ends[-1]) if len(ends) else start)
 
 
 def _vertex(image, x, y):

@@ -74,14 +74,17 @@ def _left_out(problem, out, n_components, top, strength, workers):
     variance = stamps.base + stamps.slope * np.maximum(stamps.data, 0)
     outside.weights = np.where(stamps.good, 1 / variance, 0)
     n_pixels = stamps.good.sum(axis=(1, 2))
-    return [_settled(outside, coefficients, workers) / n_pixels
-            for coefficients in stages.degrees(inside, n_components, top,
-                                               strength, workers)]
+    return [_settled(outside, coefficients, blurs, workers) / n_pixels
+            for coefficients, blurs in stages.degrees(
+                inside, n_components, top, strength, workers)]
 
 
-def _settled(problem, coefficients, workers):
+def _settled(problem, coefficients, blurs, workers):
     """Return chi^2 of stars whose own numbers are fitted."""
     now = problem.subset(np.arange(len(problem.basis)))
+    # The last exposures may have no star inside.
+    now.local = np.pad(blurs, ((0, now.exposure.max() + 1), (0, 0)))[
+        now.exposure]
     now.basis = np.ascontiguousarray(now.basis[:, :len(coefficients)])
     for _ in range(3):
         state = equations(now, coefficients, workers)

@@ -22,6 +22,7 @@ from itertools import pairwise
 import numpy as np
 
 from photutils_mgauss import _kernels
+from photutils_mgauss._field_forms import rows_of
 
 # Standard deviations of the prior on log weight, x, y (of the PSF's width),
 # log_p, s, log_q: of a polynomial's constant, and of its other terms. A good
@@ -33,6 +34,8 @@ _PRIOR_VARIATION = np.array([0.15, 0.1, 0.1, 0.07, 0.07, 0.07])
 
 # Gauss-Newton steps of the stamps' own numbers for each step of the shapes.
 _SETTLE_STEPS = 2
+# Stars whose derivatives are in memory at a time.
+_CHUNK = 256
 
 
 @dataclass
@@ -55,6 +58,11 @@ class Problem:
     fit_sky : bool
     used : (n,) `~numpy.ndarray` of bool
         Which stars the PSF is fitted to.
+    exposure : (n,) `~numpy.ndarray` of int
+    form : FreeShapes or TunedShapes
+        What the polynomials mean.
+    local : (n, ...) `~numpy.ndarray`
+        What the form needs to know of each star.
     """
 
     stamps: object
@@ -67,17 +75,20 @@ class Problem:
     sky: np.ndarray
     fit_sky: bool
     used: np.ndarray
+    exposure: np.ndarray
+    form: object
+    local: np.ndarray
 
     def subset(self, index):
         """Return the problem of some of the stars; nothing is shared."""
-        stamps = replace(self.stamps, data=self.stamps.data[index],
-                         base=self.stamps.base[index],
-                         good=self.stamps.good[index],
-                         corners=self.stamps.corners[index])
-        return replace(self, stamps=stamps, **{
+        return replace(self, stamps=self.stamps.subset(index), **{
             name: getattr(self, name)[index] for name in
             ('weights', 'basis', 'sources', 'anchors', 'hold', 'n_sources',
-             'sky', 'used')})
+             'sky', 'used', 'exposure', 'local')})
+
+    def shapes(self, coefficients):
+        """Return the shapes of the PSF at each star, (n, K, 6)."""
+        return self.form.shapes(coefficients, self.basis, self.local)[0]
 
 
 @dataclass
@@ -129,12 +140,13 @@ class Workers:
 
 
 def equations(problem, coefficients, workers):
-    """Form the normal equations at coefficients (T, K, 6)."""
+    """Form the normal equations at the coefficients."""
     parts = workers.map(
-        _PartEquations(coefficients, problem.fit_sky), len(problem.basis),
-        problem.stamps.data, problem.weights, problem.stamps.corners,
-        problem.basis, problem.sources, problem.anchors, problem.hold,
-        problem.n_sources, problem.sky, problem.used)
+        _PartEquations(coefficients, problem.fit_sky, problem.form),
+        len(problem.basis), problem.stamps.data, problem.weights,
+        problem.stamps.corners, problem.basis, problem.local,
+        problem.sources, problem.anchors, problem.hold, problem.n_sources,
+        problem.sky, problem.used)
     matrix = sum(part.matrix for part in parts)
     matrix = np.triu(matrix) + np.triu(matrix, 1).T
     return Equations(matrix, sum(part.right for part in parts),
@@ -149,34 +161,44 @@ class _PartEquations:
 
     coefficients: np.ndarray
     fit_sky: bool
+    form: object
 
-    def __call__(self, data, weights, corners, basis, sources, anchors, hold,
-                 n_sources, sky, used):
-        n_terms, k, _ = self.coefficients.shape
-        size = (6 * k - 3) * n_terms
+    def __call__(self, data, weights, corners, basis, local, sources,
+                 anchors, hold, n_sources, sky, used):
+        size = to_vector(self.coefficients).size
         total, right = np.zeros((size, size)), np.zeros(size)
         chi2 = np.empty(len(data))
         sources, sky = sources.copy(), sky.copy()
-        n = 3 * sources.shape[1] + 6 * k - 1
-        _kernels.field_normal(
-            data, weights, corners, basis, self.coefficients, sources,
-            anchors, hold, n_sources, sky, self.fit_sky, used, _SETTLE_STEPS,
-            np.empty((n, n)), total, right, chi2)
+        for first in range(0, len(data), _CHUNK):
+            part = slice(first, first + _CHUNK)
+            now = self.coefficients, basis[part], local[part]
+            rows = rows_of(*self.form.shapes(*now))
+            n = 3 * sources.shape[1] + 6 * rows.shape[1] - 1
+            _kernels.field_normal(
+                data[part], weights[part], corners[part], basis[part], rows,
+                self.form.jacobians(*now), sources[part], anchors[part],
+                hold[part], n_sources[part], sky[part], self.fit_sky,
+                used[part], _SETTLE_STEPS, np.empty((n, n)), total, right,
+                chi2[part])
         return Equations(total, right, chi2, sources, sky)
 
 
 def model_stamps(problem, coefficients):
     """Draw the fitted stamps, neighbours and sky included, (n, s, s)."""
     out = np.empty_like(problem.stamps.data)
-    _kernels.field_model(problem.stamps.corners, problem.basis, coefficients,
-                         problem.sources, problem.n_sources, problem.sky, out)
+    rows = rows_of(*problem.form.shapes(coefficients, problem.basis,
+                                        problem.local))
+    _kernels.field_model(problem.stamps.corners, rows, problem.sources,
+                         problem.n_sources, problem.sky, out)
     return out
 
 
 @dataclass
 class Prior:
     """
-    Independent Gaussians about ``mean`` with ``precision``, (T, K, 6) each.
+    Independent Gaussians about ``mean`` with ``precision``.
+
+    Both have the shape of the coefficients, (T, K, 6) or (T, N).
 
     The terms a lower degree does not have are the last ones.
     """
@@ -212,16 +234,16 @@ class Prior:
 
         Parameters
         ----------
-        coefficients : (T, K, 6) `~numpy.ndarray`
+        coefficients : `~numpy.ndarray`
         matrix : (N, N) `~numpy.ndarray`
             The normal equations at them, without the prior.
-        groups : (T, K, 6) `~numpy.ndarray` of int
+        groups : `~numpy.ndarray` of int
             The group of each coefficient, -1 for those to leave alone.
         """
-        n_terms, k, _ = coefficients.shape
         posterior = np.diag(np.linalg.inv(
             matrix + np.diag(to_vector(self.precision))))
-        squares = coefficients**2 + to_coefficients(posterior, n_terms, k)
+        squares = coefficients**2 + to_coefficients(posterior,
+                                                    coefficients)
         ratio = squares * self.precision / self.strength
         precision = self.precision.copy()
         for group in np.unique(groups[groups >= 0]):
@@ -239,15 +261,21 @@ class Prior:
 
 
 def to_vector(coefficients):
-    """Return the fitted ones of (T, K, 6) by shape, then term."""
-    return coefficients.reshape(len(coefficients), -1)[:, 3:].T.ravel()
+    """
+    Return the fitted coefficients by number, then term.
+
+    Of shapes (T, K, 6) the first three are left out; of (T, N) none is.
+    """
+    first = 3 if coefficients.ndim == 3 else 0
+    return coefficients.reshape(len(coefficients), -1)[:, first:].T.ravel()
 
 
-def to_coefficients(vector, n_terms, k):
-    """Undo `to_vector`; what is not fitted is 0."""
-    full = np.zeros((n_terms, 6 * k))
-    full[:, 3:] = vector.reshape(-1, n_terms).T
-    return full.reshape(n_terms, k, 6)
+def to_coefficients(vector, like):
+    """Undo `to_vector` in the shape of others; what is not fitted is 0."""
+    full = np.zeros((len(like), like[0].size))
+    first = 3 if like.ndim == 3 else 0
+    full[:, first:] = vector.reshape(-1, len(like)).T
+    return full.reshape(like.shape)
 
 
 def optimise(problem, coefficients, prior, workers, *, max_steps=30,
@@ -260,9 +288,8 @@ def optimise(problem, coefficients, prior, workers, *, max_steps=30,
 
     Returns
     -------
-    (T, K, 6) `~numpy.ndarray`, Equations
+    `~numpy.ndarray`, Equations
     """
-    n_terms, k, _ = coefficients.shape
     present = equations(problem, coefficients, workers)
     cost = _cost(problem, present, prior, coefficients)
     damping, growth = 1e-3, 2.0
@@ -273,7 +300,7 @@ def optimise(problem, coefficients, prior, workers, *, max_steps=30,
         right = present.right + prior.right(coefficients)
         step = _damped_step(matrix, right, damping)
         expected = step @ (2 * right - matrix @ step)
-        trial = coefficients + to_coefficients(step, n_terms, k)
+        trial = coefficients + to_coefficients(step, coefficients)
         new = equations(problem, trial, workers)
         gain = cost - _cost(problem, new, prior, trial)
         if gain > 0:

@@ -3,7 +3,7 @@ The course of a field fit: start, weights, rejection, degree after degree.
 
 Nothing here knows of images or tables; see `photutils_mgauss.field`.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,7 +13,9 @@ from photutils_mgauss._field_fit import (
     Problem,
     model_stamps,
     optimise,
+    to_vector,
 )
+from photutils_mgauss._field_forms import TunedShapes
 
 # Stars used while the degree is low: enough for its few coefficients.
 _START_STARS = 40
@@ -28,8 +30,12 @@ _STAR_EXCESS = 0.3
 _MAX_DEVIANT_PIXELS = 0.1
 # How often the prior takes the widths of the coefficients found under it.
 _ADAPTATIONS = 3
-# Log weight, means and precisions of a Gaussian vary by different amounts.
-_KINDS = np.array([0, 1, 1, 2, 2, 2])
+# Standard deviations of the prior on changes of a known PSF: of covariances,
+# of log weights, of means, in powers of the PSF's width; and the share of
+# them that varies over the field.
+_PRIOR_CHANGE = np.array([1.0, 1.0, 1.0, 0.5, 0.3, 0.3])
+_PRIOR_CHANGE_POWER = np.array([2, 2, 2, 0, 1, 1])
+_PRIOR_CHANGE_VARIATION = 0.3
 # Relative error of the PSF assumed before anything is known of it.
 _FIRST_ACCURACY = 0.1
 
@@ -49,6 +55,10 @@ class FieldFit:
     accuracy : float
         The relative error of the PSF, which is part of the weights.
     deviant_pixels : (n, s, s) `~numpy.ndarray` of bool
+    blurs : (E, 3) `~numpy.ndarray`
+        The covariance xx, xy, yy that each exposure adds [pix^2].
+    blur_matrix : (3 E, 3 E) `~numpy.ndarray` or None
+        Their normal equations, if there are several exposures.
     """
 
     problem: Problem
@@ -57,6 +67,8 @@ class FieldFit:
     equations: Equations
     accuracy: float
     deviant_pixels: np.ndarray
+    blurs: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
+    blur_matrix: np.ndarray = None
 
 
 def n_terms(degree):
@@ -211,7 +223,9 @@ def _reject(state, residual, variance):
     middle = problem.stamps.corners + problem.stamps.radius
     moved = np.abs(problem.sources[:, 0, :2] - middle).max(axis=1)
     used &= moved < max(2.0, 0.3 * problem.stamps.radius)
-    problem.used = used
+    # Of two stars, both may deviate from their mean.
+    if used.any():
+        problem.used = used
 
 
 def _deviant_pixels(pulls, used):
@@ -245,26 +259,29 @@ def run(problem, n_components, degree, workers, *, strength=1.0, reject=True):
     """
     state = _first_state(problem, n_components, degree, strength, workers)
     brightest = np.argsort(-problem.sources[:, 0, 2])
-    for low in range(degree):
+    for low in range(degree + 1):
         count = _STARS_PER_TERM * n_terms(low + 1)
+        if low == degree and count >= len(brightest):
+            break
         _stage(state, np.sort(brightest[:count]), low, workers, reject)
     return _finish(state, degree, workers, reject)
 
 
 def degrees(problem, n_components, top, strength, workers):
-    """Yield the coefficients of each degree from 0 to the top one."""
+    """Yield coefficients and blurs of each degree from 0 to the top one."""
     state = _first_state(problem, n_components, top, strength, workers)
     for degree in range(top + 1):
         _stage(state, np.arange(len(problem.basis)), degree, workers, True,
                adapt=True)
-        yield state.coefficients
+        yield state.coefficients, state.blurs
 
 
 def _first_state(problem, n_components, degree, strength, workers):
     start, shapes, width = begin(problem, n_components, strength, workers)
     prior = Prior.about(shapes, n_terms(degree), width, strength)
     return FieldFit(problem, start, prior, None, _FIRST_ACCURACY,
-                    np.zeros(problem.stamps.good.shape, bool))
+                    np.zeros(problem.stamps.good.shape, bool),
+                    np.zeros((problem.exposure.max() + 1, 3)))
 
 
 def _stage(state, index, degree, workers, reject, *, adapt=False):
@@ -274,14 +291,40 @@ def _stage(state, index, degree, workers, reject, *, adapt=False):
     few.basis = np.ascontiguousarray(few.basis[:, :terms])
     part = FieldFit(few, _raised(state.coefficients, terms),
                     state.prior.first(terms), None, state.accuracy,
-                    np.zeros(few.stamps.good.shape, bool))
+                    np.zeros(few.stamps.good.shape, bool), state.blurs)
+    few.local = state.blurs[few.exposure]
     _settle_all(part, workers)
     for _ in range(2):
+        _fit_blurs(part, workers)
         weigh(part, reject=reject, share=0.5)
         advance(part, workers, tolerance=0.3, max_steps=10)
     if adapt and degree:
         _adapt(part, workers, reject)
     state.coefficients, state.accuracy = part.coefficients, part.accuracy
+    state.blurs = part.blurs
+
+
+def _fit_blurs(state, workers):
+    """
+    Fit what each exposure adds to the covariances, the field given.
+
+    Their mean belongs to the field.
+    """
+    problem, n = state.problem, len(state.blurs)
+    if n < 2:
+        return
+    problem.local[:] = 0
+    shapes = problem.shapes(state.coefficients)
+    tuned = replace(problem, form=TunedShapes(), basis=np.eye(n)[
+        problem.exposure], local=TunedShapes.local(shapes, 1.0))
+    width = np.exp(-shapes[:, 0, [3, 5]].mean())
+    prior = Prior(np.zeros((n, 3)), np.full((n, 3), width**-4.0))
+    blurs, found = optimise(tuned, state.blurs, prior, workers, max_steps=10,
+                            tolerance=0.03)
+    state.blurs = blurs - blurs.mean(axis=0)
+    state.blur_matrix = found.matrix + np.diag(to_vector(prior.precision))
+    problem.sources, problem.sky = tuned.sources, tuned.sky
+    problem.local = state.blurs[problem.exposure]
 
 
 def _settle_all(state, workers):
@@ -291,13 +334,32 @@ def _settle_all(state, workers):
     advance(state, workers, max_steps=0)
 
 
+def tune(problem, degree, workers, *, strength=1.0, reject=True):
+    """
+    Fit changes of a known PSF, polynomials of the degree.
+
+    ``problem.local`` holds the known PSF. Returns a `FieldFit`.
+    """
+    terms = n_terms(degree)
+    stddev = np.tile(_PRIOR_CHANGE
+                     * first_width(problem) ** _PRIOR_CHANGE_POWER,
+                     (terms, 1))
+    stddev[1:] *= _PRIOR_CHANGE_VARIATION
+    start = np.zeros((terms, 6))
+    prior = Prior(start, strength / stddev**2, strength)
+    state = FieldFit(problem, start, prior, None, _FIRST_ACCURACY,
+                     np.zeros(problem.stamps.good.shape, bool))
+    return _finish(state, degree, workers, reject)
+
+
 def _finish(state, degree, workers, reject):
     terms = n_terms(degree)
     state.coefficients = _raised(state.coefficients, terms)
     _settle_all(state, workers)
     for share, tolerance in ((0.3, 0.3), (0.3, 0.1), (1, 0.01)):
+        _fit_blurs(state, workers)
         weigh(state, reject=reject, share=share)
-        advance(state, workers, tolerance=tolerance)
+        advance(state, workers, tolerance=tolerance, max_steps=8)
     for _ in range(_ADAPTATIONS if degree else 0):
         _adapt(state, workers, reject)
     return state
@@ -305,16 +367,24 @@ def _finish(state, degree, workers, reject):
 
 def _adapt(state, workers, reject):
     """Let the prior follow the coefficients, and these the prior."""
-    degrees = term_degrees(len(state.coefficients))
-    groups = 3 * (degrees[:, None, None] - 1) + _KINDS
-    groups = np.repeat(groups, state.coefficients.shape[1], axis=1)
-    groups[0] = -1
-    # Not fitted: they would repeat position and flux of the stars.
-    groups[:, 0, :3] = -1
-    state.prior = state.prior.adapted(state.coefficients,
-                                      state.equations.matrix, groups)
+    state.prior = state.prior.adapted(
+        state.coefficients, state.equations.matrix,
+        _groups(state.coefficients, state.problem.form.kinds))
     weigh(state, reject=reject)
-    advance(state, workers, tolerance=0.01)
+    advance(state, workers, tolerance=0.01, max_steps=10)
+
+
+def _groups(coefficients, kinds):
+    """Return which coefficients are of one degree and kind."""
+    degrees = term_degrees(len(coefficients))
+    groups = np.empty(coefficients.shape, int)
+    groups[:] = kinds
+    groups += 3 * (degrees - 1).reshape(-1, *[1] * (groups.ndim - 1))
+    groups[0] = -1
+    if groups.ndim == 3:
+        # Not fitted: they would repeat position and flux of the stars.
+        groups[:, 0, :3] = -1
+    return groups
 
 
 def _raised(coefficients, terms):

@@ -80,7 +80,7 @@ class StarImage:
     def __init__(self, path, layers, reading):
         self.path = Path(path)
         self.layers = layers
-        self._reading = reading
+        self.reading = reading
         self.mask = layers.mask(reading.good_bits)
         if self.mask.all():
             msg = f'{path}: must have pixels that are not bad, got none'
@@ -99,15 +99,15 @@ class StarImage:
     @cached_property
     def wcs(self):
         """The WCS, or None."""
-        if self._reading.wcs is not None:
-            return read_wcs(self._reading.wcs)
+        if self.reading.wcs is not None:
+            return read_wcs(self.reading.wcs)
         return self.layers.wcs
 
     @property
     def time(self):
         """The middle of the exposure, or None."""
-        if self._reading.time is not None:
-            return self._reading.time
+        if self.reading.time is not None:
+            return self.reading.time
         return self.layers.cards.time
 
     @property
@@ -116,14 +116,14 @@ class StarImage:
         return self._or_header('saturation')
 
     def _or_header(self, name):
-        own = getattr(self._reading, name)
+        own = getattr(self.reading, name)
         return getattr(self.layers.cards, name) if own is None else own
 
     @cached_property
     def sky(self):
         """The `~photutils.background.Background2D` of the image."""
         ny, nx = self.data.shape
-        box = min(self._reading.sky_box, ny, nx)
+        box = min(self.reading.sky_box, ny, nx)
         try:
             return Background2D(np.where(self.mask, 0, self.data), box,
                                 mask=self.mask, exclude_percentile=_BAD_SHARE)
@@ -141,12 +141,12 @@ class StarImage:
     @property
     def electrons(self):
         """The electrons in a unit of the image, or None."""
-        unit, gain = self.unit, self._reading.gain
+        unit, gain = self.unit, self.reading.gain
         if gain is None:
             gain = self.layers.cards.gain
         known = electrons_in_unit(unit, gain,
                                   self._or_header('exposure_time'))
-        return self._reading.gain if known is None else known
+        return self.reading.gain if known is None else known
 
     @cached_property
     def noise(self):

@@ -2626,19 +2626,6 @@ _TWO_PI = 2 * np.pi
 
 
 @_jit
-def shape_rows(shapes, rows):
-    """Put the rows that other kernels take into rows (K, 6)."""
-    for k in range(shapes.shape[0]):
-        a, mx, my, log_p, s, log_q = shapes[k]
-        rows[k, 0] = exp(a + log_p + log_q) / _TWO_PI
-        rows[k, 1] = mx
-        rows[k, 2] = my
-        rows[k, 3] = exp(2 * log_p)
-        rows[k, 4] = s
-        rows[k, 5] = exp(2 * log_q)
-
-
-@_jit
 def _design(x, y, rows, sources, n_sources, first, row):
     """
     Put derivatives of a pixel into row and return the model.
@@ -2815,7 +2802,7 @@ def _shift_sources(sources, n_sources, sky, fit_sky, step):
 
 
 @_jit
-def field_normal(stamps, weights, corners, basis, coefficients, sources,
+def field_normal(stamps, weights, corners, basis, rows, jacobians, sources,
                  anchors, hold, n_sources, sky, fit_sky, used, n_steps,
                  normal, total, gradient, chi2):
     """
@@ -2826,27 +2813,25 @@ def field_normal(stamps, weights, corners, basis, coefficients, sources,
     chi2 (n,) and gradient are those after it.
 
     stamps, weights (n, s, s); corners (n, 2), the pixel (x, y) of each
-    stamp's first; basis (n, T); coefficients (T, K, 6); sources, anchors,
-    hold (n, M, 3); n_sources (n,); sky (n,) with fit_sky; used (n,). normal
-    is scratch (D, D) with D = 3 M + 6 K - 1. total (P T, P T), upper
-    triangle, and gradient (P T,) order unknowns by shape, then term, with
-    P = 6 K - 3.
+    stamp's first; basis (n, T); rows (n, K, 6), the PSF of each star;
+    jacobians (n, 6 K - 3, P), the derivatives of its shapes by the P numbers
+    that are polynomials, or (0, 0, 0) if they are the shapes themselves;
+    sources, anchors, hold (n, M, 3); n_sources (n,); sky (n,) with fit_sky;
+    used (n,). normal is scratch (D, D) with D = 3 M + 6 K - 1. total
+    (P T, P T), upper triangle, and gradient (P T,) order unknowns by number,
+    then term.
     """
-    k = coefficients.shape[1]
-    shapes = np.empty((k, 6))
-    rows = np.empty((k, 6))
     block = np.empty((4, normal.shape[0]))
     step = np.empty(normal.shape[0])
     spread = np.empty(gradient.size)
+    condensed = np.empty((jacobians.shape[2], jacobians.shape[2] + 1))
     for star in range(stamps.shape[0]):
-        _shapes_at(basis[star], coefficients, shapes)
-        shape_rows(shapes, rows)
         left, bottom = corners[star]
         own = 3 * n_sources[star] + fit_sky
         for i in range(n_steps):
             last = used[star] and i == n_steps - 1
             size = _accumulate(
-                stamps[star], weights[star], left, bottom, rows,
+                stamps[star], weights[star], left, bottom, rows[star],
                 sources[star], n_sources[star], sky[star], fit_sky, last,
                 block, normal)
             _hold_neighbours(sources[star], anchors[star], n_sources[star],
@@ -2856,19 +2841,34 @@ def field_normal(stamps, weights, corners, basis, coefficients, sources,
             sky[star] = _shift_sources(sources[star], n_sources[star],
                                        sky[star], fit_sky, step)
         chi2[star] = normal[size - 1, size - 1]
-        if used[star]:
+        if not used[star]:
+            continue
+        if jacobians.size:
+            _condense(normal, own, size, jacobians[star], condensed)
+            _spread(condensed, 0, condensed.shape[1], basis[star], spread,
+                    total, gradient)
+        else:
             _spread(normal, own, size, basis[star], spread, total, gradient)
 
 
 @_jit
-def _shapes_at(basis, coefficients, shapes):
-    """Evaluate the polynomials, coefficients (T, K, 6), into (K, 6)."""
-    shapes[:] = 0.0
-    for t in range(basis.size):
-        if basis[t] != 0:
-            for k in range(shapes.shape[0]):
-                for i in range(6):
-                    shapes[k, i] += basis[t] * coefficients[t, k, i]
+def _condense(normal, own, size, jacobian, out):
+    """Put J^T A J and J^T b into out (P, P + 1), upper triangle."""
+    n, p = jacobian.shape
+    out[:] = 0.0
+    line = np.empty(p + 1)
+    for i in range(n):
+        line[:] = 0.0
+        for j in range(n):
+            a = normal[own + min(i, j), own + max(i, j)]
+            for m in range(p):
+                line[m] += a * jacobian[j, m]
+        line[p] = normal[own + i, size - 1]
+        for k in range(p):
+            share = jacobian[i, k]
+            if share != 0:
+                for m in range(k, p + 1):
+                    out[k, m] += share * line[m]
 
 
 @_jit
@@ -2890,19 +2890,14 @@ def _spread(normal, own, size, basis, spread, total, gradient):
 
 
 @_jit
-def field_model(corners, basis, coefficients, sources, n_sources, sky, out):
+def field_model(corners, rows, sources, n_sources, sky, out):
     """Put model stamps of n stars, neighbours and sky included, into out."""
-    k = coefficients.shape[1]
-    shapes = np.empty((k, 6))
-    rows = np.empty((k, 6))
     for star in range(out.shape[0]):
-        _shapes_at(basis[star], coefficients, shapes)
-        shape_rows(shapes, rows)
         left, bottom = corners[star]
         out[star] = sky[star]
         for j in range(n_sources[star]):
             x, y, flux = sources[star, j]
-            render(rows, x - left, y - bottom, flux, False, out[star])
+            render(rows[star], x - left, y - bottom, flux, False, out[star])
 
 
 # Crowded fields: all stars of an image together. Star i is fitted on a square
@@ -3178,7 +3173,10 @@ def _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node, share,
 
     Returns the product of v and the outcome.
     """
-    mesh_out[:] = mesh @ mesh_v
+    for m in range(mesh_v.size):
+        mesh_out[m] = 0.0
+        for n in range(mesh_v.size):
+            mesh_out[m] += mesh[m, n] * mesh_v[n]
     product = 0.0
     for i in range(v.shape[0]):
         level = 0.0

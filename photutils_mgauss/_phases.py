@@ -10,6 +10,8 @@ import numpy as np
 
 SIZES = (5, 7)
 _MIN_PHASES = 4
+# A stamp with less of the star's light than this fraction tells nothing.
+_LEAST_LIGHT = 1e-3
 
 
 def phase_rows(mixture, flux, shape, pitch, origin, used, sizes=SIZES):
@@ -61,6 +63,7 @@ def _rows_of_size(mixture, flux, shape, pitch, origin, peak, size, x, y):
     slope, value = mixture.gradient(u, v), mixture.evaluate(u, v)
     jacobian = np.stack([-flux * slope[..., 0], -flux * slope[..., 1], value],
                         axis=-1).reshape(len(y), len(x), size**2, 3)
+    jacobian[value.sum(axis=(-2, -1)) < _LEAST_LIGHT] = 0
     errors = np.linalg.pinv(jacobian)[:, :, :2]
     errors = errors.reshape(len(y), len(x), 2, size, size)
     across = _interpolation(columns, shape[1])[None, :, None]

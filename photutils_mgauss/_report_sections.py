@@ -32,16 +32,17 @@ def psf_section(path):
     panels = [Panel(lambda ax: plotting.plot_psf_image(ax, psf, *middle),
                     'The PSF in the middle of the detector.')]
     if len(psf.grid_xypos) > 1:
-        panels += _maps(psf)
+        panels += _maps(psf, record.get('stars'))
     return Section(f'PSF: {path}', facts=facts, panels=tuple(panels),
                    record=record)
 
 
-def _maps(psf):
+def _maps(psf, stars):
     coarse = _thinned(psf)
     panels = [
-        Panel(lambda ax: plotting.plot_width_map(ax, psf),
-              'The width of the PSF over the detector.'),
+        Panel(lambda ax: plotting.plot_width_map(ax, psf, stars=stars),
+              'The width of the PSF over the detector'
+              + (', and the stars it was made of.' if stars else '.')),
         Panel(lambda ax: plotting.plot_whiskers(ax, coarse),
               'The ellipticity of the PSF, as whiskers along its long '
               'axis.')]

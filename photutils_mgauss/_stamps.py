@@ -18,6 +18,8 @@ _MAX_STEPS = 500
 # A Gaussian narrower than this in stamp pixels falls between the pixel
 # centres and can take any flux.
 _MIN_STDDEV = 0.4
+# A net flux below this fraction of what cancels in it is rounding error.
+_LEAST_FLUX = 1e-4
 # How firmly the total flux is tied and limits are kept, in units of the
 # power of the image.
 _TIE = 1e6
@@ -138,6 +140,11 @@ class Solution(NamedTuple):
     cost: float
     stopped: bool
 
+    @property
+    def has_flux(self):
+        """Whether flux is left where Gaussians cancel."""
+        return self.fluxes.sum() > _LEAST_FLUX * np.abs(self.fluxes).sum()
+
 
 def run(stamp, problem, spaces, shapes, max_steps=_MAX_STEPS):
     """Return what Levenberg-Marquardt makes of a start (K, 5)."""
@@ -192,19 +199,21 @@ def refine_astrometry(stamp, problem, spaces, solution):
     """
     for price in _ASTROMETRY:
         mapped, solution = _price(stamp, problem, spaces, solution, price)
-        best, stopped = solution, True
+        best, improving = solution, False
         for _ in range(_ASTROMETRY_ROUNDS):
+            before = solution.cost
             trial = run(mapped, problem, spaces, solution.shapes,
                         _ASTROMETRY_STEPS)
-            mapped, trial = _price(stamp, problem, spaces, trial, price)
-            change = abs(trial.cost - solution.cost)
-            solution = trial
+            if not trial.has_flux:
+                break
+            mapped, solution = _price(stamp, problem, spaces, trial, price)
+            small = _ASTROMETRY_TOLERANCE * best.cost
+            improving = solution.cost < best.cost - small
             best = min(best, solution, key=lambda each: each.cost)
-            if change < _ASTROMETRY_TOLERANCE * best.cost:
-                stopped = False
+            if abs(solution.cost - before) < small:
                 break
         solution = best
-    return solution._replace(stopped=stopped)
+    return solution._replace(stopped=improving)
 
 
 def _price(stamp, problem, spaces, solution, price):

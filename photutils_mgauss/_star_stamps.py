@@ -1,5 +1,5 @@
 """Stamps of stars cut from an image, and the noise model of their pixels."""
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -22,7 +22,7 @@ class Stamps:
         Which pixels are inside the circle and can be used.
     corners : (n, 2) `~numpy.ndarray`
         The pixel (x, y) of each stamp's first.
-    slope : float
+    slope : (n, 1, 1) `~numpy.ndarray`
         Variance for each unit of light of a star (one over the gain).
     """
 
@@ -30,12 +30,24 @@ class Stamps:
     base: np.ndarray
     good: np.ndarray
     corners: np.ndarray
-    slope: float
+    slope: np.ndarray
 
     @property
     def radius(self):
         """Half the width of a stamp, in whole pixels."""
         return self.data.shape[1] // 2
+
+    def subset(self, index):
+        """Return some of the stamps."""
+        return Stamps(*(getattr(self, one.name)[index]
+                        for one in fields(self)))
+
+    @classmethod
+    def joined(cls, parts):
+        """Return stamps of one size as one."""
+        return cls(*(np.concatenate([getattr(part, one.name)
+                                     for part in parts])
+                     for one in fields(cls)))
 
     def offsets(self):
         """Return the distance of each pixel from the middle one, (s, s)."""
@@ -75,7 +87,8 @@ def cut_stamps(data, error, mask, x, y, radius):
     good &= np.isfinite(stamps) & np.isfinite(variance) & (variance > 0)
     stamps[~good] = 0
     variance[~good] = 1
-    new = Stamps(stamps, variance, good, corners, 0.0)
+    new = Stamps(stamps, variance, good, corners,
+                 np.zeros((len(corners), 1, 1)))
     new.good &= new.offsets() <= radius + 0.5
     return new
 
@@ -122,7 +135,7 @@ def remove_star_noise(stamps, gain):
     floor = max(0.1 * np.median(rest[stamps.good]),
                 1e-3 * np.median(stamps.base[stamps.good]))
     stamps.base = np.where(stamps.good, np.maximum(rest, floor), 1.0)
-    stamps.slope = slope
+    stamps.slope[:] = slope
 
 
 def _poisson_slope(stamps):

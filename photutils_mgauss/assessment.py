@@ -36,6 +36,20 @@ class PSFAssessment:
         components. NaN where a shape could not be measured.
     grid_shape : (int, int)
         The number of places along y and x.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import GaussianMixture, assess_psf
+    >>> def truth(x, y):
+    ...     return GaussianMixture([1], [[0, 0]], [[[2, 0], [0, 2]]])
+    >>> def model(x, y):
+    ...     return GaussianMixture([1], [[0, 0]], [[[2, 0], [0, 2 + x / 1e4]]])
+    >>> report = assess_psf(model, truth, (2, 3), shape=(100, 101))
+    >>> report.map('size_error').round(4)
+    array([[ 0.    , -0.0012, -0.0025],
+           [ 0.    , -0.0012, -0.0025]])
+    >>> round(report.median('ellipticity_error'), 4)
+    -0.0012
     """
 
     table: QTable

@@ -54,6 +54,29 @@ class UnfinishedTilesError(RuntimeError):
         The parts of the image, in pixels, without a result.
     table : `~astropy.table.QTable`
         The stars of the tiles that were finished.
+
+    Examples
+    --------
+    Take what there is, and solve the rest again:
+
+    >>> import numpy as np
+    >>> from concurrent.futures import ThreadPoolExecutor
+    >>> from photutils_mgauss import (CrowdedMixturePhotometry,
+    ...                               GaussianMixture, GriddedMixturePSF,
+    ...                               UnfinishedTilesError)
+    >>> mixture = GaussianMixture([1], [[0, 0]], [[[0.7, 0], [0, 0.8]]])
+    >>> psf = GriddedMixturePSF([mixture], [(0, 0)])
+    >>> pool = ThreadPoolExecutor()
+    >>> pool.shutdown()  # all of its workers are gone
+    >>> phot = CrowdedMixturePhotometry(psf, executor=pool)
+    >>> try:
+    ...     table = phot(np.ones((40, 50)), error=np.ones((40, 50)))
+    ... except UnfinishedTilesError as error:
+    ...     table, left = error.table, error.unfinished
+    >>> left
+    [(0, 40, 0, 50)]
+    >>> len(table)
+    0
     """
 
     def __init__(self, unfinished, table):
@@ -107,7 +130,9 @@ class CrowdedMixturePhotometry:
     maxiters : int, optional
         The largest number of searches at the final threshold.
     tile_shape : int or (ny, nx) tuple of int, optional
-        The image is solved in tiles of this many pixels.
+        The image is solved in tiles of this many pixels. Smaller ones need
+        less memory, spread over more workers, and cost more: each sees 96 to
+        128 pixels beyond its borders if the background is fitted.
     overlap : int, optional
         How far a tile sees beyond its borders [pix].
     executor : `~concurrent.futures.Executor`, optional
@@ -157,7 +182,7 @@ class CrowdedMixturePhotometry:
 
     def __init__(self, psf_model, *, threshold=4.5, keep=2.5,
                  background_size=64, psf_error=0.01, effective_gain=None,
-                 maxiters=3, tile_shape=512, overlap=48, executor=None,
+                 maxiters=3, tile_shape=1024, overlap=48, executor=None,
                  progress_bar=False):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)

@@ -20,14 +20,10 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, lsqr
 
 from photutils_mgauss import _field_stages as stages
-from photutils_mgauss._star_stamps import cut_stamps, remove_star_noise
+from photutils_mgauss._field_input import normalised, read_sample
+from photutils_mgauss._field_result import lattice
 from photutils_mgauss._validation import as_integer, as_real, as_shape
-from photutils_mgauss.field import (
-    MixtureField,
-    _nodes,
-    _normalised,
-    fit_mixture_field,
-)
+from photutils_mgauss.field import MixtureField, fit_mixture_field
 
 __all__ = ['EmpiricalPSF']
 
@@ -55,6 +51,22 @@ class EmpiricalPSF:
         The degree of the polynomials.
     oversampling : int
         Samples per pixel.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from photutils_mgauss import EmpiricalPSF, GaussianMixture
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0], [0, 2]]])
+    >>> stars = Table({'x': [12.3, 40.1], 'y': [14.6, 33.9]})
+    >>> data = sum(psf.render((50, 55), x, y, flux=900) for x, y in stars)
+    >>> empirical = EmpiricalPSF.from_stars(
+    ...     data, stars, error=np.ones((50, 55)), degree=0, radius=8,
+    ...     n_components=1)
+    >>> empirical
+    <EmpiricalPSF(37 x 37 samples, oversampling=2, degree=0)>
+    >>> empirical.to_gridded_psf((2, 3)).data.shape
+    (6, 73, 73)
     """
 
     field: MixtureField
@@ -71,7 +83,7 @@ class EmpiricalPSF:
     def from_stars(cls, data, stars, *, error=None, mask=None, degree=3,
                    oversampling=2, radius=10, n_components=3, executor=None):
         """
-        Measure the PSF from the stars of an image.
+        Measure the PSF from the stars of one or more exposures.
 
         Positions and fluxes of the stars are those of a mixture field fitted
         first; deviant stars and pixels are left out as there.
@@ -79,7 +91,7 @@ class EmpiricalPSF:
         Parameters
         ----------
         data, stars, error, mask
-            See `fit_mixture_field`.
+            See `fit_mixture_field`; lists of them for several exposures.
         degree : int, optional
             The degree of the polynomials, in field and correction.
         oversampling : int, optional
@@ -119,7 +131,8 @@ class EmpiricalPSF:
             data, stars, error=error, mask=mask, n_components=n_components,
             degree=degree, radius=radius, executor=executor)
         problem = _Lattice.of(field, oversampling)
-        target, weights = _corrections(field, data, error, mask)
+        target, weights = _corrections(field, read_sample(
+            data, stars, error, mask, field.radius, None).stamps)
         coefficients = problem.solve(field, target, weights)
         return cls(field, coefficients, field.degree, oversampling)
 
@@ -146,7 +159,7 @@ class EmpiricalPSF:
                 else as_integer(oversampling, 'oversampling', minimum=1))
         half = self.coefficients.shape[1] // 2 * fine // self.oversampling
         steps = np.arange(-half, half + 1) / fine
-        basis = stages.polynomials(*_normalised([x], [y], self.field.shape),
+        basis = stages.polynomials(*normalised([x], [y], self.field.shape),
                                    self.degree)[0]
         lattice = np.tensordot(basis, self.coefficients, 1)
         taps = _taps(steps, self.oversampling, len(lattice)).toarray()
@@ -172,22 +185,17 @@ class EmpiricalPSF:
         """
         from astropy.nddata import NDData
         from photutils.psf import GriddedPSFModel
-        rows, columns = as_shape(grid_shape, 'grid_shape')
+        grid = as_shape(grid_shape, 'grid_shape')
         fine = 2 * self.oversampling if oversampling is None else oversampling
-        places = [(x, y) for y in _nodes(rows, self.field.shape[0])
-                  for x in _nodes(columns, self.field.shape[1])]
+        places = list(zip(*lattice(grid, self.field.shape), strict=True))
         images = [self.image_at(x, y, oversampling=fine) for x, y in places]
         return GriddedPSFModel(NDData(np.array(images), meta={
             'grid_xypos': places, 'oversampling': fine}))
 
 
-def _corrections(field, data, error, mask):
+def _corrections(field, stamps):
     """Return what the field leaves of each star, per flux, and weights."""
     table = field.stars
-    stamps = cut_stamps(np.asarray(data), error, mask, np.asarray(table['x']),
-                        np.asarray(table['y']), field.radius)
-    if error is not None:
-        remove_star_noise(stamps, None)
     flux = np.asarray(table['flux_fit'])[:, None, None]
     used = np.isfinite(field.residual_stars) & stamps.good
     used &= np.asarray(table['used'])[:, None, None] & (flux > 0)
@@ -228,7 +236,7 @@ class _Lattice:
                       for name in ('y', 'x')]
             taps.append([_taps(steps + one, oversampling, size)
                          for one in offset])
-        basis = stages.polynomials(*_normalised(
+        basis = stages.polynomials(*normalised(
             table['x'], table['y'], field.shape), field.degree)
         return cls(taps, basis, size)
 

@@ -39,7 +39,17 @@ __all__ = ['FitStatus', 'MixtureFit', 'fit_mixture']
 
 
 class FitStatus(IntEnum):
-    """How a fit ended; ``sentence`` says it in words."""
+    """
+    How a fit ended; ``sentence`` says it in words.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import FitStatus
+    >>> FitStatus.EMPTY.sentence
+    'There is no positive flux in the pixels used, so nothing to fit.'
+    >>> [status.name for status in FitStatus if status.usable]
+    ['CONVERGED', 'STOPPED', 'VANISHED', 'AT_LIMIT']
+    """
 
     CONVERGED = 0
     STOPPED = 1
@@ -116,6 +126,18 @@ class MixtureFit:
         without flux.
     used : (ny, nx) `~numpy.ndarray` of bool
         The pixels that were used.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import GaussianMixture, fit_mixture
+    >>> psf = GaussianMixture([1], [[0.1, 0]], [[[2, 0], [0, 1.5]]])
+    >>> fit = fit_mixture(psf.render((15, 15), 7, 7, flux=20), 1)
+    >>> fit.status.name, fit.flux
+    ('CONVERGED', 20.0)
+    >>> fit.mixture.means
+    array([[0.1, 0. ]])
+    >>> fit.residual.shape, fit.covariance.shape, bool(fit.used.all())
+    ((15, 15), (6, 6), True)
     """
 
     mixture: GaussianMixture
@@ -354,9 +376,9 @@ def _fit_image(problem, spaces, image, weight, start):
     else:
         solution = run(stamp, problem, spaces,
                        shapes_of(start, problem, stamp.centre))
-    if problem.astrometric:
+    if problem.astrometric and solution.has_flux:
         solution = refine_astrometry(stamp, problem, spaces, solution)
-    if not solution.fluxes.sum() > 0:
+    if not solution.has_flux:
         return _failure(FitStatus.EMPTY, image)
     return _report(problem, stamp, image, narrow_first(solution),
                    spaces[problem.n_components])

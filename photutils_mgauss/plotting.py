@@ -6,6 +6,7 @@ Colours are those of Okabe and Ito, which the colour-blind can tell apart.
 import numpy as np
 from astropy.stats import mad_std
 
+from photutils_mgauss._plot_field import plot_field
 from photutils_mgauss.shapes import adaptive_moments
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     'plot_ellipses',
     'plot_error_curve',
     'plot_errors_by_epochs',
+    'plot_field',
     'plot_model_graph',
     'plot_motion_errors',
     'plot_node_map',
@@ -675,7 +677,8 @@ def plot_proper_motions(ax, stars):
     `~matplotlib.axes.Axes`
         The same; reference objects are orange.
     """
-    reference = np.asarray(stars['reference']) != ''
+    # A file gives the empty words of stars back as missing ones.
+    reference = np.ma.filled(stars['reference'], '') != ''
     for which, colour, label in ((~reference, BLUE, 'stars'),
                                  (reference, ORANGE, 'references')):
         some = stars[which]
@@ -782,7 +785,7 @@ def plot_psf_image(ax, psf, x, y, *, radius=8, decades=4):
     return ax
 
 
-def plot_width_map(ax, psf):
+def plot_width_map(ax, psf, *, stars=None):
     r"""
     Map the width of the nodes' PSFs, :math:`2.35 \sqrt{R^2 / 2}`.
 
@@ -792,6 +795,8 @@ def plot_width_map(ax, psf):
         Where to draw.
     psf : GriddedMixturePSF
         The PSF.
+    stars : (n, 2) array_like, optional
+        Positions of the stars it was made of, to be marked [pix].
 
     Returns
     -------
@@ -802,12 +807,15 @@ def plot_width_map(ax, psf):
     x, y = psf.grid_xypos.T
     points = ax.scatter(x, y, c=fwhm, s=12, marker='s', cmap='cividis')
     ax.figure.colorbar(points, ax=ax, label='FWHM [pix]')
+    if stars is not None and len(stars):
+        ax.plot(*np.transpose(stars), 'o', color=ORANGE, fillstyle='none',
+                markersize=6)
     ax.set_title(f'FWHM: median {np.median(fwhm):.3f}, '
                  f'range {np.ptp(fwhm):.2g} pix')
     return _focal_plane(ax, {'': psf}, {'': (0, 0)})
 
 
-def plot_detections(ax, x, y, flux, *, psf_stars=None):
+def plot_detections(ax, x, y, flux):
     """
     Map the stars of a catalogue, brighter ones larger.
 
@@ -817,8 +825,6 @@ def plot_detections(ax, x, y, flux, *, psf_stars=None):
         Where to draw.
     x, y, flux : (n,) array_like
         Positions [pix] and fluxes.
-    psf_stars : (m, 2) array_like, optional
-        The positions of stars to mark.
 
     Returns
     -------
@@ -828,10 +834,6 @@ def plot_detections(ax, x, y, flux, *, psf_stars=None):
     flux = np.maximum(np.nan_to_num(flux), 1e-300)
     size = np.clip(np.log10(flux / np.percentile(flux, 5)), 0.1, 3)
     ax.scatter(x, y, s=4 * size**2, color=BLACK, linewidths=0, alpha=0.7)
-    if psf_stars is not None and len(psf_stars):
-        ax.scatter(*np.transpose(psf_stars), s=40, facecolors='none',
-                   edgecolors=ORANGE, label='stars of the PSF')
-        ax.legend()
     ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal',
            title=f'{len(flux)} stars')
     return ax

@@ -24,7 +24,19 @@ _MAX_STEPS = 500
 
 
 class ShapeStatus(IntEnum):
-    """How adaptive moments ended; ``sentence`` says it in words."""
+    """
+    How adaptive moments ended; ``sentence`` says it in words.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from photutils_mgauss import ShapeStatus, adaptive_moments
+    >>> shapes = adaptive_moments(np.zeros((9, 9)))
+    >>> ShapeStatus(shapes.status).name
+    'EMPTY'
+    >>> ShapeStatus.EMPTY.sentence
+    'There is no positive flux under the weight.'
+    """
 
     CONVERGED = 0
     STOPPED = 1
@@ -73,6 +85,18 @@ class Shapes:
         Standard errors; NaN where no errors of pixels were given.
     status : int or (n,) `~numpy.ndarray`
         Values of `ShapeStatus`.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import GaussianMixture, adaptive_moments
+    >>> psf = GaussianMixture([1], [[0.2, 0]], [[[3, 0.5], [0.5, 2]]])
+    >>> shapes = adaptive_moments([psf, psf.affine([[2, 0], [0, 2]])])
+    >>> shapes.r2
+    array([ 5., 20.])
+    >>> shapes.ellipticity
+    array([0.28284271, 0.28284271])
+    >>> shapes.message[0]
+    'The moments converged.'
     """
 
     r2: np.ndarray

@@ -2,6 +2,8 @@
 import json
 import os
 import re
+import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -87,20 +89,15 @@ def test_the_demonstration_recovers_the_true_motions(demo):
 
 @pytest.fixture(scope='module')
 def chain(tmp_path_factory):
-    """Go from images to a page; return the folder with all of it."""
+    """Do what README.md says; return the folder with all of it."""
     folder = tmp_path_factory.mktemp('chain')
-    succeed('demo', '--images-only', '--size', 400, '--epochs', 2,
-            '--output', 'images', '--quiet', folder=folder)
-    images = ['images/night1.fits', 'images/night2.fits']
-    succeed('psf', *images, '--n-components', 3, '--degree', 1,
-            '--grid-shape', 5, 6, folder=folder)
-    succeed('photometry', *images, '--psf', 'night1_psf.fits',
-            'night2_psf.fits', '--fit-shape', 9, '--quiet', folder=folder)
-    succeed('motions', 'night1_cat.ecsv', 'night2_cat.ecsv', '--references',
-            'images/quasars.ecsv', '--output', 'motions', '--quiet',
-            folder=folder)
-    succeed('report', 'night1_psf.fits', 'night1_cat.ecsv', 'motions',
-            '--output', 'report.html', '--quiet', folder=folder)
+    readme = Path(__file__).parents[1] / 'README.md'
+    lines = re.findall(r'^mgauss .*$', readme.read_text(encoding='utf-8'),
+                       re.MULTILINE)
+    assert [line.split()[1] for line in lines] == [
+        'demo', 'psf', 'photometry', 'motions', 'report']
+    for line in lines:
+        succeed(*shlex.split(line)[1:], folder=folder)
     return folder
 
 
@@ -122,13 +119,12 @@ def test_images_become_psfs_of_their_own_stars(chain):
     for number in (1, 2):
         path = chain / f'night{number}_psf.fits'
         psf = GriddedMixturePSF.read(path)
-        assert psf.grid_shape == (5, 6)
-        assert psf.n_components == 3
+        assert psf.n_components == 5
         record = json.loads(fits.getheader(path)['MGRUN'])
         assert record['command'] == 'psf'
         assert record['version'] == __version__
-        assert record['options']['degree'] == 1
-        assert record['n_stars'] > 20
+        assert record['options']['min_snr'] == 50
+        assert record['n_stars'] > 60
         assert record['reading'] == {'image': 'SCI', 'error': 'ERR',
                                      'flags': 'DQ'}
 
@@ -138,10 +134,10 @@ def test_catalogues_have_places_on_the_sky_that_are_true(chain):
     assert {'x_fit', 'xy_cov', 'ra_err', 'radec_cov'} <= set(table.colnames)
     assert str(table['flux_fit'].unit) == 'electron'
     record = table.meta['mgauss']
-    assert record['options']['fit_shape'] == 9
+    assert record['options']['fit_shape'] == 11
     assert record['exposure']['image'] == 'images/night1.fits'
     table, true = beside_truth(chain, table[table['flags'] == 0])
-    assert len(table) > 40
+    assert len(table) > 120
     away = (table['x_fit'] - true['x'].value) / table['x_err']
     assert 0.7 < 1.48 * np.median(np.abs(away)) < 1.4
 
@@ -156,7 +152,7 @@ def test_catalogues_become_true_motions(chain):
     table = table[np.isfinite(table['pmra'].value)]
     table, true = beside_truth(chain, table)
     stars = true['kind'] == 'star'
-    assert stars.sum() > 30
+    assert stars.sum() > 80
     for name in ('pmra', 'pmdec'):
         pull = ((table[name] - true[name]) / table[f'{name}_error'])[stars]
         assert 0.6 < 1.48 * np.median(np.abs(pull)) < 1.6
@@ -190,7 +186,8 @@ def test_the_page_needs_no_other_file(chain):
 def test_images_become_motions_in_one_command(chain):
     run = succeed('motions', 'images/night1.fits', 'images/night2.fits',
                   '--n-components', 3, '--degree', 1, '--output', 'direct',
-                  '--format', 'fits', '--fit-shape', 9,
+                  '--format', 'fits', '--fit-shape', 9, '--transform',
+                  'similarity',
                   '--wcs', 'images/night1_wcs.asdf', 'images/night2_wcs.asdf',
                   folder=chain)
     assert 'stars have proper motions' in run.stdout
@@ -200,8 +197,9 @@ def test_images_become_motions_in_one_command(chain):
         'night2_psf.fits', 'night2_wcs.asdf', 'residuals.fits']
     table = QTable.read(chain / 'direct' / 'motions.fits')
     record = json.loads(table.meta['MGRUN'])
-    assert record['options']['transform'] == 'affine'
-    assert np.isfinite(table['pmra'].value).sum() > 40
+    assert record['options']['fit_shape'] == 9
+    assert record['options']['transform'] == 'similarity'
+    assert np.isfinite(table['pmra'].value).sum() > 100
     assert hasattr(read_wcs(chain / 'direct' / 'night1_wcs.asdf'),
                    'pipeline')
 
@@ -217,6 +215,38 @@ def test_a_crowded_measurement_finds_the_same_stars(chain, monkeypatch):
     sparse, _ = beside_truth(chain, QTable.read(chain / 'night1_cat.ecsv'))
     shared = set(found['x_fit'].round(1)) & set(sparse['x_fit'].round(1))
     assert len(shared) > 0.8 * len(sparse)
+
+
+def test_a_catalogue_remembers_the_wcs_it_was_measured_with(chain,
+                                                            monkeypatch):
+    monkeypatch.chdir(chain)
+    for number in (1, 2):
+        assert main(['photometry', f'images/night{number}.fits', '--psf',
+                     f'night{number}_psf.fits', '--wcs',
+                     f'images/night{number}_wcs.asdf', '--output',
+                     f'gwcs/night{number}_cat.ecsv', '--quiet']) == 0
+    assert main(['motions', 'gwcs/night1_cat.ecsv', 'gwcs/night2_cat.ecsv',
+                 '--output', 'gwcs/motions', '--quiet']) == 0
+    assert {'night1_wcs.asdf', 'night2_wcs.asdf'} <= set(
+        files_in('gwcs/motions'))
+
+
+def test_without_its_image_a_catalogue_still_has_its_places(chain, tmp_path,
+                                                            monkeypatch):
+    monkeypatch.chdir(chain)
+    names = ['night1_cat.ecsv', 'night2_cat.ecsv']
+    moved = [shutil.copy(name, tmp_path) for name in names]
+    common = ['--transform', 'similarity', '--quiet', '--output']
+    assert main(['motions', *names, *common, str(tmp_path / 'one')]) == 0
+    assert main(['motions', *moved, *common, str(tmp_path / 'two')]) == 0
+    one, two = (QTable.read(tmp_path / name / 'motions.ecsv')
+                for name in ('one', 'two'))
+    for column in ('pmra', 'pmdec', 'pmra_error', 'pmra_pmdec_corr'):
+        np.testing.assert_allclose(
+            np.asarray(one[column]), np.asarray(two[column]), rtol=1e-4,
+            atol=1e-4)
+    assert files_in(tmp_path / 'two') == [
+        'alignment.ecsv', 'motions.ecsv', 'residuals.ecsv']
 
 
 def test_psfs_are_rewritten_and_used_in_the_other_format(chain, capsys):

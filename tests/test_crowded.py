@@ -1,5 +1,6 @@
 """Crowded fields: laws of the joint fit, of finding, and of tiles."""
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -193,13 +194,42 @@ def test_the_table_has_the_columns_of_photutils(fitted):
     assert (np.abs(fitted['neighbor_correlation']) <= 1).all()
 
 
-def test_tiles_do_not_change_a_star(crowd, fitted):
-    table = photometry(tile_shape=(70, 64))(crowd[0], error=crowd[1])
-    distance, _ = nearest(table, fitted['x_fit'], fitted['y_fit'])
-    assert len(table) == pytest.approx(len(fitted), abs=4)
-    assert (distance < 1e-3).mean() > 0.95
-    sigma = distance / np.hypot(fitted['x_err'], fitted['y_err'])
-    assert np.percentile(sigma, 97) < 0.1
+def test_tiles_do_not_change_a_star():
+    rng = np.random.default_rng(8)
+    n = 1800
+    x, y = rng.uniform(-0.5, 229.5, (2, n))
+    flux = 10**rng.uniform(2.3, 5, n)
+    data, error = expose(draw(x, y, flux, (230, 230)), 9)
+    whole = photometry()(data, error=error)
+    tiles = photometry(tile_shape=(115, 120))(data, error=error)
+    distance, row = nearest(tiles, whole['x_fit'], whole['y_fit'])
+    assert len(tiles) == pytest.approx(len(whole), rel=0.002)
+    bright = whole['flux_fit'] > 5 * whole['flux_err']
+    assert (distance < 1e-3)[bright].mean() > 0.995
+    error = np.hypot(whole['x_err'], whole['y_err'])
+    assert np.percentile(distance / error, 99.5) < 0.05
+    change = tiles['flux_fit'][row] / whole['flux_fit'] - 1
+    assert np.percentile(np.abs(change), 99) < 1e-3
+
+
+def test_processes_give_what_threads_give(crowd, fitted):
+    with ProcessPoolExecutor(1, get_context('spawn')) as pool:
+        table = photometry(tile_shape=70, executor=pool)(crowd[0],
+                                                         error=crowd[1])
+    threads = photometry(tile_shape=70)(crowd[0], error=crowd[1])
+    assert_allclose(table['x_fit'], threads['x_fit'], atol=1e-9)
+
+
+def test_dask_gives_what_threads_give(crowd, fitted):
+    distributed = pytest.importorskip('distributed')
+    with distributed.Client(processes=False, n_workers=1,
+                            threads_per_worker=1,
+                            dashboard_address=None) as client:
+        pool = client.get_executor()
+        table = photometry(tile_shape=70, executor=pool)(crowd[0],
+                                                         error=crowd[1])
+    threads = photometry(tile_shape=70)(crowd[0], error=crowd[1])
+    assert_allclose(table['x_fit'], threads['x_fit'], atol=1e-9)
 
 
 def test_the_residual_image_is_noise(crowd):
@@ -312,6 +342,14 @@ def test_a_killed_worker_leaves_the_finished_tiles(crowd):
         phot(crowd[0], error=crowd[1])
     assert len(caught.value.table) > 50
     assert (0, 70, 70, 140) in caught.value.unfinished
+
+
+def test_the_progress_bar_tells_of_stars_and_chi2(crowd, capsys):
+    photometry(progress_bar=True)(crowd[0][:50, :50],
+                                  error=crowd[1][:50, :50])
+    shown = capsys.readouterr().err
+    assert 'stars=' in shown
+    assert 'chi2=' in shown
 
 
 @pytest.mark.parametrize(('keyword', 'value', 'error'), [

@@ -10,7 +10,11 @@ from astropy.stats import sigma_clipped_stats
 from astropy.table import QTable
 from photutils.psf import PSFPhotometry, SourceGrouper
 
-from photutils_mgauss import MixturePSFPhotometry, fit_mixture_field
+from photutils_mgauss import (
+    CrowdedMixturePhotometry,
+    MixturePSFPhotometry,
+    fit_mixture_field,
+)
 
 STARS = np.array([(41, 4), (8, 23), (31, 25), (29, 34), (36, 42), (23, 7),
                   (18, 8), (36, 22), (26, 22)]) - 1.0
@@ -42,3 +46,17 @@ def test_positions_are_better_than_those_of_allstar(image, rng, photometry,
     offsets = np.column_stack([result['x_fit'], result['y_fit']]) - STARS
     rms = np.sqrt((offsets**2).mean(axis=0))
     assert (rms < ALLSTAR_RMS).all(), rms
+
+
+def test_all_nine_are_found_and_better_than_with_allstar(image):
+    data, error = image
+    x, y = STARS.T
+    psf = fit_mixture_field(data, QTable({'x': x, 'y': y}), error=error,
+                            degree=0, n_components=2, radius=8).to_grid(1)
+    found = CrowdedMixturePhotometry(psf)(data + 100, error=error)
+    bright = found[np.argsort(-found['flux_fit'])[:9]]
+    position = np.column_stack([bright['x_fit'], bright['y_fit']])
+    gap = np.linalg.norm(position[:, None] - STARS, axis=2)
+    offsets = position[gap.argmin(axis=0)] - STARS
+    assert (np.sqrt((offsets**2).mean(axis=0)) < ALLSTAR_RMS).all()
+    assert len(found) <= 10

@@ -14,6 +14,7 @@ from photutils_mgauss._field_fit import (
     equations,
     to_coefficients,
 )
+from photutils_mgauss._field_forms import FreeShapes
 from photutils_mgauss._star_stamps import Stamps
 
 SHAPE = (200, 240)
@@ -130,14 +131,15 @@ def test_a_grid_is_the_field_at_its_nodes(field):
     assert_allclose(np.sort(node.weights), np.sort(mixture.weights))
 
 
-def test_the_slope_of_chi2_is_the_right_side_of_the_equations(rng):
-    problem = small_problem(rng)
+@pytest.mark.parametrize('blur', [0, 0.4, -0.15])
+def test_the_slope_of_chi2_is_the_right_side_of_the_equations(rng, blur):
+    problem = small_problem(rng, np.full((4, 3), blur) * [1, 0.3, 0.8])
     coefficients = rng.normal(0, 0.1, (3, 2, 6))
     coefficients[:, 0, :3] = 0
     coefficients[0, 1, 3:] -= 0.5
     with Workers() as workers:
         def chi2(vector):
-            change = to_coefficients(vector, 3, 2)
+            change = to_coefficients(vector, coefficients)
             now = problem.subset(np.arange(4))
             for _ in range(8):
                 state = equations(now, coefficients + change, workers)
@@ -153,14 +155,15 @@ def test_the_slope_of_chi2_is_the_right_side_of_the_equations(rng):
             assert_allclose(-2 * right[i], slope, rtol=1e-3, atol=0.05)
 
 
-def small_problem(rng):
+def small_problem(rng, local):
     """Four stars, the first with a neighbour, on a local sky."""
     y, x = np.mgrid[:17, :17] - 8.0
     psf = np.exp(-0.5 * (x**2 + y**2) / 2.2)
     data = 200 * psf + rng.normal(0, 1, (4, 17, 17))
     data[0] += 80 * np.exp(-0.5 * ((x - 5) ** 2 + (y - 2) ** 2) / 2.2)
     good = np.ones(data.shape, bool)
-    stamps = Stamps(data, np.ones(data.shape), good, np.zeros((4, 2)), 0.0)
+    stamps = Stamps(data, np.ones(data.shape), good, np.zeros((4, 2)),
+                    np.zeros((4, 1, 1)))
     sources = np.zeros((4, 2, 3))
     sources[:, 0] = 8.1, 7.9, 3000
     sources[0, 1] = 13, 10, 900
@@ -168,7 +171,7 @@ def small_problem(rng):
     basis = np.column_stack([np.ones(4), [-1, 1, 0.3, 0], [0.5, 0, -1, 1]])
     return Problem(stamps, good / 1.0, basis, sources, sources.copy(), hold,
                    np.array([2, 1, 1, 1]), np.zeros(4), True,
-                   np.ones(4, bool))
+                   np.ones(4, bool), np.zeros(4, int), FreeShapes(), local)
 
 
 def test_one_absurdly_bright_blend_is_dropped(stars, clean):

@@ -403,6 +403,17 @@ def test_astrometric_weighting_removes_the_pixel_phase_error(f814w):
 
 @pytest.mark.filterwarnings('ignore:non-ASCII characters',
                             'ignore:The following header keyword')
+@pytest.mark.parametrize('node', [9, 18, 36, 44])
+def test_eight_gaussians_centre_to_a_thousandth_of_a_pixel(f814w, node):
+    fit = fit_mixture(f814w[node, 30:71, 30:71], 8, oversampling=4,
+                      weighting='astrometric')
+    for size in (5, 7):
+        errors = centroid_errors(fit.mixture, f814w[node], size, 4)
+        assert np.sqrt(np.mean(errors**2)) < 1e-3
+
+
+@pytest.mark.filterwarnings('ignore:non-ASCII characters',
+                            'ignore:The following header keyword')
 def test_pixel_phase_errors_are_linear_in_the_residual(f814w):
     image = f814w[24, 30:71, 30:71]
     fit = fit_mixture(image, 5, oversampling=4)

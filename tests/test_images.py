@@ -157,6 +157,20 @@ def test_of_several_images_one_must_be_chosen(tmp_path, sky):
             read_image(path, Reading(ext=wrong))
 
 
+def test_compressed_images_are_read(tmp_path, sky):
+    hdus = fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(
+        sky, header(GAIN=1.0), compression_type='RICE_1',
+        quantize_level=256)])
+    hdus.writeto(tmp_path / 'a.fits.fz')
+    image = read_image(tmp_path / 'a.fits.fz')
+    assert_allclose(image.data, sky, atol=0.1)
+    assert image.electrons == 1
+    fits.PrimaryHDU(sky).writeto(tmp_path / 'b.fits.gz')
+    fits.PrimaryHDU(np.eye(*SHAPE, dtype=np.int16)).writeto(
+        tmp_path / 'b_flg.fits.gz')
+    assert read_image(tmp_path / 'b.fits.gz').mask.sum() == min(SHAPE)
+
+
 def test_companions_are_found_by_their_names(tmp_path, sky):
     flags = np.zeros(SHAPE, np.int16)
     flags[1, 2] = 4

@@ -75,3 +75,30 @@ def test_the_worst_node_is_shown_in_per_cent(ax):
     assert 'node (80, 40)' in ax.get_title()
     residual = ax.images[0].get_array()
     assert 20 < residual[36, 36] < 50
+
+
+def test_maps_of_a_run_show_what_they_were_given():
+    rng = np.random.default_rng(5)
+    mixtures = [GaussianMixture([1], [[0, 0]], [[[s**2, 0], [0, s**2]]])
+                for s in (1.0, 1.5, 1.0, 1.5)]
+    psf = GriddedMixturePSF(mixtures, [(0, 0), (90, 0), (0, 90), (90, 90)])
+    from matplotlib.figure import Figure
+    axes = Figure().subplots(2, 2).ravel()
+    plotting.plot_width_map(axes[0], psf, stars=[(10, 20), (30, 40)])
+    width = axes[0].collections[0].get_array()
+    assert_allclose(width, 2.3548 * np.array([1, 1.5, 1, 1.5]), rtol=1e-5)
+    assert any(len(line.get_xdata()) == 2 and line.get_marker() == 'o'
+               for line in axes[0].lines)
+    plotting.plot_psf_image(axes[1], psf, 0, 0, radius=4)
+    image = axes[1].images[0].get_array()
+    assert_allclose(image.max(), 0, atol=1e-12)
+    # At 2 px from a Gaussian of 1 px: log10 exp(-2).
+    assert_allclose(image[80, 120], -2 / np.log(10), rtol=1e-6)
+    x, y = rng.uniform(0, 90, (2, 7))
+    plotting.plot_detections(axes[2], x, y, np.geomspace(1, 100, 7))
+    sizes = axes[2].collections[0].get_sizes()
+    assert np.all(np.diff(sizes) >= 0)
+    plotting.plot_stated_errors(axes[3], np.arange(3), {
+        'x_err': [1, 2, 3], 'y_err': [2, 3, 4]}, unit='pix')
+    assert [line.get_label() for line in axes[3].lines] == ['x_err', 'y_err']
+    assert axes[3].get_ylabel() == 'stated error [pix]'

@@ -1,6 +1,7 @@
 """Figures of motions contain what they say."""
 import numpy as np
 import pytest
+from astropy.table import QTable
 from motion_scenes import TIMES, make_truth, observe
 from numpy.testing import assert_allclose
 
@@ -41,6 +42,15 @@ def test_the_diagram_shows_stars_and_references(axes, solutions):
     shown = [len(line.get_xdata()) for line in axes.lines[:2]]
     assert sorted(shown) == [40, 80]
     assert axes.xaxis_inverted()
+
+
+def test_a_table_read_from_a_file_is_drawn_like_the_one_written(
+        axes, solutions, tmp_path):
+    from photutils_mgauss.plotting import plot_proper_motions
+    solutions[1].stars.write(tmp_path / 'stars.ecsv')
+    plot_proper_motions(axes, QTable.read(tmp_path / 'stars.ecsv'))
+    shown = [len(line.get_xdata()) for line in axes.lines[:2]]
+    assert sorted(shown) == [40, 80]
 
 
 def test_errors_against_magnitude_and_epochs_are_those_of_the_table(

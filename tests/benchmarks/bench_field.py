@@ -2,19 +2,30 @@
 Positions with a PSF field from 150 stars, against the Cramer-Rao bound.
 
     python tests/benchmarks/bench_field.py --harness DIR SCENE [SCENE ...]
-        [--stars 150] [--n-components 5] [--degree auto] [--peers psfex,epsf]
-        [--time]
+        [--stars 150] [--n-components 6] [--degree 4]
+        [--peers psfex,empirical,epsf] [--time]
+    python tests/benchmarks/bench_field.py --decam DIR
 
 A scene is a folder with sci.fits, mask.fits, vartrue.fits, truth.ecsv and
 meta.json; the harness is the folder of the modules that made it (csst_psf,
 metrics, peers), which know the true PSF. Stars that were not used for the PSF
 are fitted with the field's grid and with the true PSF, on the same pixels
 with the same variance. Errors are in units of each star's bound, after the
-cubic correction of positions that the harness makes. Peers are fitted by
-photutils with their own pixels, in this process.
+cubic correction of positions that the harness makes. Peers are made of the
+same stars and fitted by photutils with their own pixels, and as mixtures of
+three Gaussians made of those pixels; 'empirical' is EmpiricalPSF. Shapes are
+compared with the truth on a 30 x 30 grid. --time measures 150 and 3,000 stars
+with K = 5 and degree 3.
+
+--decam needs the folder with 117 stars of a DECam chip (decam_psfex) and
+psfex on the path, which models the same three quarters of the stars; the last
+quarter is fitted with both.
 """
 import argparse
+import resource
+import subprocess
 import sys
+import tempfile
 import time
 import warnings
 from pathlib import Path
@@ -23,6 +34,8 @@ import numpy as np
 from astropy.table import QTable, Table
 
 from photutils_mgauss import (
+    EmpiricalPSF,
+    GriddedMixturePSF,
     MixturePSFPhotometry,
     assess_psf,
     fit_mixture_field,
@@ -131,14 +144,15 @@ def run_scene(path, options):
     stars, field = fit_field(meta, images, options)
     test = test_stars(meta, truth, stars)
     grid = field.to_grid((30, 30))
-    print_shapes(grid, truth_psf)
+    print_shapes('field', grid, truth_psf)
     mag = np.asarray(test['mag'])
     rows = []
     for name, fitted in [
             ('true PSF', fit_with_truth(truth_psf, meta, data, variance,
                                         test)),
             ('field', fit_with_field(grid, data, np.sqrt(variance), test)),
-            *peers(path, meta, images, stars, test, options)]:
+            *peers(path, meta, images, stars, test, truth_psf,
+                   options)]:
         error, bound = errors_in_bounds(meta, truth_psf, images, test, fitted)
         pull = (error / fitted[:, 3:5] if fitted.shape[1] > 3
                 else np.full(error.shape, np.nan))
@@ -146,44 +160,61 @@ def run_scene(path, options):
     return rows
 
 
-def print_shapes(grid, truth_psf):
+def print_shapes(label, psf, truth_psf):
+    """Compare a PSF that has mixtures or is a photutils model."""
     def truth(x, y):
         return truth_psf.epsf(x, y, 2, 61)
 
-    report = assess_psf(grid, truth, (30, 30), oversampling=2)
-    for name in ('size_error', 'ellipticity_error', 'e1_error', 'e2_error'):
-        values = np.asarray(report.table[name])
-        print(f'  {name:18s} median {np.median(values):+.4f}  standard '
-              f'deviation {values.std():.4f}  robust '
-              f'{scatter(values - np.median(values)):.4f}')
+    steps = np.arange(-30, 31) / 2
+    dx, dy = np.meshgrid(steps, steps)
+
+    def pixels(x, y):
+        return psf.evaluate(x + dx.ravel(), y + dy.ravel(), 1, x, y).reshape(
+            dx.shape)
+
+    model = psf if hasattr(psf, 'mixture_at') else pixels
+    report = assess_psf(model, truth, (30, 30), oversampling=2,
+                        shape=(int(truth_psf.chip),) * 2)
+    print(f'  {label}:', ', '.join(
+        f'{name} {np.median(values):+.4f} +- {values.std():.4f} (robust '
+        f'{scatter(values - np.median(values)):.4f})'
+        for name, values in ((name, np.asarray(report.table[name]))
+                             for name in ('size_error', 'ellipticity_error'))),
+          flush=True)
 
 
-def peers(path, meta, images, stars, test, options):
+def peers(path, meta, images, stars, test, truth_psf, options):
     """Yield name and fits of the peers asked for."""
     chosen = stars[stars['selected']]
     data, error = images['sci'] - meta['bkg'], np.sqrt(images['vartrue'])
     for name in options.peers:
-        psf, model = make_peer(name, path, meta, data, chosen)
+        psf = make_peer(name, path, meta, images, chosen)
+        print_shapes(name, psf, truth_psf)
         yield name, fit_with_photutils(psf, data, error, test)
-        if model is not None:
-            from photutils_mgauss import GriddedMixturePSF
-            chain = GriddedMixturePSF.from_gridded_psf(model, 3, radius=7)
+        if name != 'epsf':
+            chain = GriddedMixturePSF.from_gridded_psf(psf, 3, radius=7)
+            print_shapes(f'{name} -> K = 3', chain, truth_psf)
             yield f'{name} -> K = 3', fit_with_field(chain, data, error,
                                                      test)
 
 
-def make_peer(name, path, meta, data, stars):
-    """Return the PSF for photutils, and its grid where it has one."""
+def make_peer(name, path, meta, images, stars):
+    """Return the PSF as a model of photutils."""
     import peers as harness
+    data = images['sci'] - meta['bkg']
     if name == 'epsf':
         table = Table({'x': stars['x'], 'y': stars['y']})
-        return harness.build_epsf(data, table), None
-    work = Path(path) / 'psfex_work'
-    catalogue, _ = harness.run_sex(Path(path) / 'sci.fits', work,
-                                   vignet=True)
-    file = harness.run_psfex(keep_stars(catalogue, stars), work)
-    grid = harness.gridded(harness.psfex_grid(file, meta['n']))
-    return grid, grid
+        return harness.build_epsf(data, table)
+    if name == 'empirical':
+        return EmpiricalPSF.from_stars(
+            data, stars, error=images['err'], mask=images['mask'],
+            radius=RADIUS).to_gridded_psf((15, 15))
+    with tempfile.TemporaryDirectory() as work:
+        catalogue, _ = harness.run_sex(Path(path) / 'sci.fits', work,
+                                       vignet=True)
+        file = harness.run_psfex(keep_stars(catalogue, stars), work,
+                                 SAMPLE_AUTOSELECT='N')
+        return harness.gridded(harness.psfex_grid(file, meta['n']))
 
 
 def keep_stars(catalogue, stars):
@@ -239,46 +270,152 @@ def pooled(scenes):
 
 
 def print_times(path, options):
-    """Time 150 and 3,000 stars of 21x21, K = 5, degree 3."""
-    import resource
-    meta, images, truth, _ = read_scene(path, options.harness)
-    data = images['sci'] - meta['bkg']
-    bright = truth[np.argsort(truth['mag'])]
-    for n in (150, 3000):
-        stars = Table({'x': np.resize(np.asarray(bright['x'][:600]), n),
-                       'y': np.resize(np.asarray(bright['y'][:600]), n)})
-        stars['selected'] = True
-        if n == 3000:
-            data, images, stars = tiled(data, images, stars[:600])
-        wall, cpu = time.perf_counter(), time.process_time()
-        fit_mixture_field(data, stars, error=images['err'], n_components=5,
-                          degree=3, radius=RADIUS)
-        print(f'{len(stars)} stars: {time.perf_counter() - wall:.1f} s, '
+    """Time 150 and 3,000 stars of 21x21, K = 5, degree 3, when compiled."""
+    meta, _, _, truth_psf = read_scene(path, options.harness)
+    rng = np.random.default_rng(1)
+    for n, size in ((30, 2048), (150, 2048), (3000, 4096)):
+        data, error, stars = many_stars(truth_psf, n, size, meta['bkg'], rng)
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            wall, cpu = time.perf_counter(), time.process_time()
+            field = fit_mixture_field(data, stars, error=error, degree=3,
+                                      n_components=5, radius=RADIUS)
+        print(f'{field}: {time.perf_counter() - wall:.1f} s, '
               f'{time.process_time() - cpu:.1f} s CPU; largest memory '
               f'{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f}'
               ' GB, images included', flush=True)
 
 
-def tiled(data, images, stars):
-    """Return five copies of the scene in a row, as one image."""
-    step = data.shape[1]
-    places = [Table({'x': stars['x'] + i * step, 'y': stars['y']})
-              for i in range(5)]
-    from astropy.table import vstack
-    return (np.tile(data, (1, 5)), {'err': np.tile(images['err'], (1, 5))},
-            vstack(places))
+def many_stars(truth_psf, n, size, sky, rng):
+    """Draw n stars with the true PSF stretched over a detector."""
+    chip, truth_psf.chip = truth_psf.chip, size
+    stars = Table({'x': rng.uniform(15, size - 16, n),
+                   'y': rng.uniform(15, size - 16, n)})
+    clean = np.zeros((size, size))
+    truth_psf.render(clean, np.asarray(stars['x']), np.asarray(stars['y']),
+                     10 ** rng.uniform(4, 5.3, n), 20)
+    truth_psf.chip = chip
+    variance = np.maximum(clean, 0) + sky + 25
+    return rng.normal(clean, np.sqrt(variance)), np.sqrt(variance), stars
+
+
+def decam_stars(folder):
+    """Return the catalogue's file and rows, image, error and star table."""
+    from astropy.io import fits
+    file = next(Path(folder).glob('*findstars.fits'))
+    rows = fits.getdata(file, 2)
+    x, y = rows['X_IMAGE'] - 1.0, rows['Y_IMAGE'] - 1.0
+    data = np.full((4096, 2048), np.nan)
+    for vignette, x_0, y_0 in zip(rows['VIGNET'], x, y, strict=True):
+        left, bottom = int(np.rint(x_0)) - 31, int(np.rint(y_0)) - 31
+        y_in, x_in = np.mgrid[bottom:bottom + 63, left:left + 63]
+        inside = ((x_in >= 0) & (y_in >= 0) & (x_in < 2048) & (y_in < 4096)
+                  & (vignette > -1e29))
+        data[y_in[inside], x_in[inside]] = vignette[inside]
+    # Sky noise 9 ADU, 3.9 electrons per ADU.
+    error = np.sqrt(81 + np.maximum(np.nan_to_num(data), 0) / 3.9)
+    return file, data, error, Table({'x': x, 'y': y})
+
+
+def psfex_of(file, keep):
+    """Return psfex's model of some rows of an LDAC catalogue."""
+    from astropy.io import fits
+
+    from photutils_mgauss import read_psfex
+    with tempfile.TemporaryDirectory() as work, fits.open(file) as hdus:
+        hdus[2].data = hdus[2].data[keep]
+        some = Path(work) / 'some.fits'
+        hdus.writeto(some)
+        subprocess.run(
+            ['psfex', str(some), '-BASIS_TYPE', 'PIXEL', '-PSF_SAMPLING',
+             '0.5', '-PSF_SIZE', '63,63', '-PSFVAR_DEGREES', '2',
+             '-SAMPLE_AUTOSELECT', 'N', '-PSF_DIR', work, '-CHECKPLOT_DEV',
+             'NULL', '-CHECKIMAGE_TYPE', 'NONE', '-WRITE_XML', 'N'],
+            check=True, capture_output=True, cwd=work)
+        return read_psfex(some.with_suffix('.psf'))
+
+
+def fit_spline(spline, data, error, x, y, half=None):
+    """
+    Return position and reduced chi^2 of a star within 12 pixels.
+
+    half is 0 or 1 for every other pixel, as on a chessboard.
+    """
+    cut = np.s_[int(np.rint(y)) - 12:int(np.rint(y)) + 13,
+                int(np.rint(x)) - 12:int(np.rint(x)) + 13]
+    y_in, x_in = np.mgrid[cut]
+    good = np.isfinite(data[cut])
+    if half is not None:
+        good &= (x_in + y_in) % 2 == half
+    pixels, sigma = data[cut][good], error[cut][good]
+    place = np.array([x, y])
+    for _ in range(8):
+        offset = y_in[good] - place[1], x_in[good] - place[0]
+        profile, by_y, by_x = (spline.ev(*offset, dx=dx, dy=dy) for dx, dy
+                               in ((0, 0), (1, 0), (0, 1)))
+        flux = (profile / sigma**2) @ pixels / np.sum((profile / sigma)**2)
+        slopes = np.column_stack([profile, -flux * by_x, -flux * by_y])
+        residual = (pixels - flux * profile) / sigma
+        step = np.linalg.lstsq(slopes / sigma[:, None], residual)[0]
+        place += np.clip(step[1:], -1, 1)
+    chi2 = np.sum((residual - slopes @ step / sigma)**2) / (good.sum() - 3)
+    return np.append(place, chi2)
+
+
+def print_decam(folder):
+    """Fit left-out stars of a DECam chip with both PSFs."""
+    from scipy.interpolate import RectBivariateSpline
+    file, data, error, stars = decam_stars(folder)
+    near = np.minimum(stars['x'], stars['y']) > 14
+    near &= (stars['x'] < 2048 - 15) & (stars['y'] < 4096 - 15)
+    out = np.arange(len(stars)) % 4 == 0
+    field = fit_mixture_field(data, stars[~out], error=error, degree=2,
+                              n_components=5, radius=12)
+    theirs = psfex_of(file, ~out)
+    lattice = np.arange(-36, 37) / 2
+
+    def mine(x, y):
+        image = field.mixture_at(x, y).evaluate(lattice, lattice[:, None])
+        return RectBivariateSpline(lattice, lattice, image)
+
+    def psfex(x, y):
+        image = theirs.image_at(x, y)
+        steps = [(np.arange(n) - origin) * theirs.sampling for n, origin in
+                 zip(image.shape[::-1], theirs.origin, strict=True)]
+        return RectBivariateSpline(steps[1], steps[0], image)
+
+    print(f'{field}; {np.sum(out & near)} stars left out')
+    results = {}
+    for name, psf in (('field', mine), ('psfex', psfex)):
+        fits = np.array([[fit_spline(psf(x, y), data, error, x, y, half)
+                          for half in (None, 0, 1)]
+                         for x, y in stars[out & near].iterrows()])
+        change = fits[:, 1, :2] - fits[:, 2, :2]
+        results[name] = np.median(fits[:, 0, 2]), scatter(change) / 2
+        print(f'{name}: reduced chi^2 median {results[name][0]:.3f}, centroid '
+              f'repeatability (halves of the pixels) {results[name][1]:.4f} '
+              'pix', flush=True)
+    print('field over psfex: chi^2 {:.3f}, repeatability {:.3f}'.format(
+        *np.divide(results['field'], results['psfex'])))
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
-    parser.add_argument('scenes', nargs='+')
-    parser.add_argument('--harness', type=Path, required=True)
+    parser.add_argument('scenes', nargs='*')
+    parser.add_argument('--harness', type=Path)
+    parser.add_argument('--decam', type=Path)
     parser.add_argument('--stars', type=int, default=150)
-    parser.add_argument('--n-components', type=number, default=5)
-    parser.add_argument('--degree', type=number, default='auto')
+    parser.add_argument('--n-components', type=number, default=6)
+    parser.add_argument('--degree', type=number, default=4)
     parser.add_argument('--peers', type=lambda s: s.split(','), default=[])
     parser.add_argument('--time', action='store_true')
     options = parser.parse_args()
+    if options.decam:
+        print_decam(options.decam)
+    if not options.scenes:
+        return
+    if options.harness is None:
+        parser.error('scenes need --harness, the folder of its modules')
     sys.path.insert(0, str(options.harness))
     scenes = [run_scene(path, options) for path in options.scenes]
     print_table(pooled(scenes))

@@ -5,7 +5,9 @@ Run as ``python tests/benchmarks/bench_sampling.py``. Both sample the paper's
 priors on the same stamp with the same NUTS of PyMC, seed and chains; the
 literal model's labels are sorted out afterwards by the same function. Prints
 wall-clock and CPU seconds (children included), R-hat, effective sizes, and
-how far apart the two posteriors are in units of their width.
+how far apart the two posteriors are in units of their width. With
+``--sampler`` nutpie or numpyro, where installed, take the place of PyMC's
+NUTS on our side; ``--no-literal`` leaves the literal model out.
 """
 import argparse
 import os
@@ -87,8 +89,28 @@ def describe(name, seconds, draws):
           f'effective size {min(map(effective_size, scalars)):.0f}')
 
 
-def main():
-    """Sample both ways and compare."""
+def compare(image, own, start, own_seconds, arguments):
+    """Print how the literal model does beside our draws."""
+    middle = clock()
+    raw, _ = literal(image, arguments.k, start, arguments)
+    seconds = clock() - middle
+    describe('literal, as sampled', seconds, raw)
+    theirs = relabel(*raw, start)
+    describe('literal, relabelled', seconds, theirs)
+    wall, cpu = own_seconds / seconds
+    print(f'sample_mixture takes {wall:.2f} of its time, {cpu:.2f} of its '
+          'CPU time')
+    one, other = flat(own), flat(theirs)
+    shift = abs(one.mean(axis=(1, 2)) - other.mean(axis=(1, 2))) / one.std(
+        axis=(1, 2))
+    ratio = one.std(axis=(1, 2)) / other.std(axis=(1, 2))
+    print(f'difference of means over width: median {np.median(shift):.3f}, '
+          f'largest {shift.max():.3f}; ratio of widths '
+          f'{ratio.min():.3f} to {ratio.max():.3f}')
+
+
+def read_arguments():
+    """Return the arguments of the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--stamps', help='npz file with an array stamps')
     parser.add_argument('--index', type=int, default=44)
@@ -99,10 +121,17 @@ def main():
     parser.add_argument('--chains', type=int, default=4)
     parser.add_argument('--cores', type=int, default=2)
     parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--sampler', default='pymc')
+    parser.add_argument('--no-literal', action='store_true')
     parser.add_argument('--start', action='store_true',
                         help='start the literal model at least squares too, '
                         'else its chains find other modes')
-    arguments = parser.parse_args()
+    return parser.parse_args()
+
+
+def main():
+    """Sample both ways and compare."""
+    arguments = read_arguments()
     if arguments.stamps:
         with np.load(arguments.stamps) as file:
             image = file['stamps'][arguments.index]
@@ -113,10 +142,10 @@ def main():
         image, arguments.k, prior='paper', pixel_scale=PIXEL_SCALE,
         oversampling=2, draws=arguments.draws, tune=arguments.tune,
         chains=arguments.chains, cores=arguments.cores,
-        random_seed=arguments.seed)
+        sampler=arguments.sampler, random_seed=arguments.seed)
     middle = clock()
     own = [getattr(ours, name) for name in NAMES]
-    describe('sample_mixture', middle - before, own)
+    describe(f'sample_mixture ({arguments.sampler})', middle - before, own)
     fit = ours.fit
     errors = np.sqrt(np.diag(fit.covariance)).reshape(-1, 6)
     widths = np.column_stack([
@@ -124,19 +153,8 @@ def main():
         ours.gamma.std(axis=(0, 1))])
     print('least-squares errors over posterior widths, median over '
           f'parameters: {np.median(errors[:, 1:] / widths):.3f}')
-    middle = clock()
-    raw, _ = literal(image, arguments.k, fit.mixture, arguments)
-    seconds = clock() - middle
-    describe('literal, as sampled', seconds, raw)
-    theirs = relabel(*raw, fit.mixture)
-    describe('literal, relabelled', seconds, theirs)
-    one, other = flat(own), flat(theirs)
-    shift = abs(one.mean(axis=(1, 2)) - other.mean(axis=(1, 2))) / one.std(
-        axis=(1, 2))
-    ratio = one.std(axis=(1, 2)) / other.std(axis=(1, 2))
-    print(f'difference of means over width: median {np.median(shift):.3f}, '
-          f'largest {shift.max():.3f}; ratio of widths '
-          f'{ratio.min():.3f} to {ratio.max():.3f}')
+    if not arguments.no_literal:
+        compare(image, own, ours.fit.mixture, middle - before, arguments)
 
 
 if __name__ == '__main__':

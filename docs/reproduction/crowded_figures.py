@@ -1,0 +1,408 @@
+"""A field as dense as the bulge: Figs. 13 and 14."""
+from functools import partial
+
+import numpy as np
+from astropy.table import QTable, Table
+from matplotlib.figure import Figure as Canvas
+from peers import (
+    AbsentError,
+    absent,
+    crowdsource,
+    psfex,
+    sextractor,
+    windowed,
+)
+from scenes import background_free, cubic, detector, find_stars, robust_fit
+from scipy.ndimage import binary_dilation
+from scipy.spatial import cKDTree
+from settings import PIXEL
+from store import COLOURS, MARKS, Comparison, Figure, Group, binned, plain
+
+from photutils_mgauss import (
+    CrowdedMixturePhotometry,
+    Exposure,
+    Instrument,
+    MixturePSFPhotometry,
+    cramer_rao,
+    crowded_field,
+    simulate,
+)
+
+EDGES = np.arange(17, 26)
+MARGIN = 12
+OURS = 'crowded, mixture field'
+SEXTRACTOR = ('SExtractor IMAGE', 'SExtractor WIN', 'SExtractor PSF')
+MAS = 1000 * PIXEL
+
+
+def scene_of(run):
+    """Return the corner of detector 8 that is simulated, and its PSF."""
+    one = detector(run, 8, run.settings.sky_size)
+    shape = (run.settings.crowded_size,) * 2
+    scene = simulate(crowded_field(shape, rng=41), Exposure(band='g'),
+                     instrument=Instrument(shape=shape), psf=one.truth,
+                     rng=42)
+    return one, scene
+
+
+def measure(run):
+    """Return the errors of every method by magnitude."""
+    made = []
+
+    def crowd():
+        if not made:
+            made.append(Crowd(run, *scene_of(run)))
+        return made[0]
+    lists = {}
+    for name, method in METHODS.items():
+        try:
+            stored = name.replace(' ', '_').replace(',', '').replace('=', '')
+            lists[name] = run.table(
+                f'crowded_{stored}',
+                lambda method=method: QTable(method(crowd())), keep=False)
+        except AbsentError as error:
+            run.skipped.setdefault(name, str(error))
+    return {'run': run, 'crowd': crowd, 'errors': run.table(
+        'fig14_errors', lambda: _errors(crowd(), lists))}
+
+
+class Crowd:
+    """The crowded image and what all methods start from."""
+
+    def __init__(self, run, one, scene):
+        self.run, self.one, self.scene = run, one, scene
+        self.data, self.noise = background_free(scene)
+        self._stars = None
+        self._sextractor = {}
+
+    @property
+    def detected(self):
+        """Starting positions: those of SExtractor, as in the paper."""
+        if self._stars is None:
+            self._stars = self._detect()
+        return self._stars
+
+    def _detect(self):
+        try:
+            found = self.sextractor()
+        except AbsentError:
+            x, y = find_stars(self.data, self.noise, self.scene.mask)
+        else:
+            x, y = found['XWIN_IMAGE'] - 1, found['YWIN_IMAGE'] - 1
+        flux = _aperture(self.data, x, y)
+        good = np.isfinite(x) & np.isfinite(y)
+        return Table({'x_init': np.asarray(x, float)[good],
+                      'y_init': np.asarray(y, float)[good],
+                      'flux_init': np.maximum(flux, 1)[good]})
+
+    def sextractor(self, psf=None):
+        """Return the list of SExtractor, made once with each PSF."""
+        if psf not in self._sextractor:
+            self._sextractor[psf] = sextractor(
+                self.scene.image, psf=psf, threshold=2.0, contrast=0)
+        return self._sextractor[psf]
+
+
+def _aperture(data, x, y):
+    """Return the light within 5 x 5 pixels of places."""
+    ny, nx = data.shape
+    column = np.clip(np.rint(np.nan_to_num(x)).astype(int), 2, nx - 3)
+    row = np.clip(np.rint(np.nan_to_num(y)).astype(int), 2, ny - 3)
+    return sum(data[row + i, column + j] for i in range(-2, 3)
+               for j in range(-2, 3))
+
+
+# The methods: each returns a table of x, y and flux.
+
+def from_sextractor(x, y, flux, crowd):
+    """Return the centres of one of SExtractor's three modes."""
+    path = None
+    if x == 'XPSF_IMAGE':
+        path = (crowd.run.folder / 'partial' / 'sky_08.psf').resolve()
+        psfex(crowd.one.sparse.image, crowd.run.settings.degree, path)
+    found = crowd.sextractor(path)
+    good = np.isfinite(found[x]) & (found[flux] > 0)
+    found = found[good]
+    return Table({'x': np.asarray(found[x], float) - 1,
+                  'y': np.asarray(found[y], float) - 1,
+                  'flux': np.asarray(found[flux], float)})
+
+
+def with_sep(crowd):
+    """Return windowed centres of the detected stars."""
+    start = crowd.detected
+    return windowed(crowd.data, start['x_init'], start['y_init'])
+
+
+def with_photutils(crowd):
+    """Return fits of photutils with the empirical PSF, star by star."""
+    from photutils.psf import PSFPhotometry
+    psf = crowd.one.empirical.to_gridded_psf((10, 10))
+    photometry = PSFPhotometry(psf, (7, 7), xy_bounds=1.0,
+                               aperture_radius=2.5)
+    return _plain(photometry(crowd.data, error=crowd.scene.error,
+                             mask=crowd.scene.mask,
+                             init_params=crowd.detected))
+
+
+def star_by_star(crowd):
+    """Return fits of three Gaussians, star by star, as in the paper."""
+    photometry = MixturePSFPhotometry(
+        crowd.one.chain, (7, 7), xy_bounds=1.0, aperture_radius=2.5)
+    return _plain(photometry(crowd.data, error=crowd.scene.error,
+                             mask=crowd.scene.mask,
+                             init_params=crowd.detected))
+
+
+def together(name, crowd):
+    """Return all stars found and fitted together."""
+    photometry = CrowdedMixturePhotometry(crowd.one.models[name])
+    return _plain(photometry(crowd.scene.image, error=crowd.scene.error,
+                             mask=crowd.scene.mask))
+
+
+def with_crowdsource(crowd):
+    """Return crowdsource's own list, with our mixture field as its PSF."""
+    return crowdsource(crowd.run.crowdsource_python, crowd.data,
+                       crowd.scene.error, crowd.scene.mask,
+                       crowd.one.models['field'])
+
+
+def left_out(name, crowd):
+    """Say that a program is not run."""
+    raise absent(name)
+
+
+def _plain(table):
+    out = plain(table['x_fit', 'y_fit', 'flux_fit'])
+    out.rename_columns(('x_fit', 'y_fit', 'flux_fit'), ('x', 'y', 'flux'))
+    return out[np.isfinite(out['x']) & np.isfinite(out['y'])
+               & (out['flux'] > 0)]
+
+
+METHODS = {
+    'SExtractor IMAGE': partial(from_sextractor, 'X_IMAGE', 'Y_IMAGE',
+                                'FLUX_AUTO'),
+    'SExtractor WIN': partial(from_sextractor, 'XWIN_IMAGE', 'YWIN_IMAGE',
+                              'FLUX_AUTO'),
+    'SExtractor PSF': partial(from_sextractor, 'XPSF_IMAGE', 'YPSF_IMAGE',
+                              'FLUX_PSF'),
+    'sep windowed': with_sep,
+    'photutils, empirical PSF': with_photutils,
+    'star by star, K = 3': star_by_star,
+    'crowded, K = 3': partial(together, 'paper'),
+    OURS: partial(together, 'field'),
+    'crowdsource': with_crowdsource,
+    'DAOPHOT': partial(left_out, 'DAOPHOT'),
+    'DOLPHOT': partial(left_out, 'DOLPHOT'),
+}
+
+
+# Errors
+
+def _errors(crowd, lists):
+    """Return a row for each method and magnitude."""
+    truth = _truth(crowd)
+    found = {name: _matched(crowd, plain(table), truth)
+             for name, table in lists.items()}
+    bound = _bound(crowd, truth)
+    rows = []
+    for name, (errors, false) in found.items():
+        for low, here in binned(truth['mag'], EDGES):
+            counted = here & truth['counted']
+            rows.append((name, low + 0.5, *_row(
+                errors, found[OURS][0], bound, counted), false))
+    return QTable(rows=rows, names=(
+        'method', 'mag', 'number', 'completeness', 'median_error',
+        'crowded_same_stars', 'bound', 'false_share'),
+        units=(None, 'mag', None, None, 'mas', 'mas', 'mas', None))
+
+
+def _row(errors, ours, bound, counted):
+    """Return number, completeness and medians of one bin."""
+    mine = counted & np.isfinite(errors)
+    both = mine & np.isfinite(ours)
+    return (int(counted.sum()), mine.sum() / max(counted.sum(), 1),
+            _median(errors[mine]), _median(ours[both]),
+            _median(bound[counted]))
+
+
+def _median(values):
+    return MAS * np.median(values) if len(values) >= 5 else np.nan
+
+
+def _truth(crowd):
+    """Return the stars on the image, and whether they count."""
+    truth = plain(crowd.scene.truth['x', 'y', 'mag', 'flux'])
+    n = crowd.run.settings.crowded_size
+    inside = ((np.minimum(truth['x'], truth['y']) > -0.5)
+              & (np.maximum(truth['x'], truth['y']) < n - 0.5))
+    truth = truth[inside]
+    near = binary_dilation(crowd.scene.mask, iterations=2)
+    x, y = (np.clip(np.rint(truth[c]).astype(int), 0, n - 1) for c in 'xy')
+    truth['counted'] = (~near[y, x] & (np.minimum(x, y) > MARGIN)
+                        & (np.maximum(x, y) < n - 1 - MARGIN))
+    return truth
+
+
+def _matched(crowd, table, truth):
+    """Return each true star's error [pix] or NaN, and the false share."""
+    n = crowd.run.settings.crowded_size
+    zero = np.median(truth['mag'] + 2.5 * np.log10(truth['flux']))
+    table = _centred(table, truth, zero, n)
+    i, j = _pairs(table, truth, zero, 0.5, 1.0)
+    errors = np.full(len(truth), np.nan)
+    errors[j] = np.hypot(table['x'][i] - truth['x'][j],
+                         table['y'][i] - truth['y'][j])
+    return errors, 1 - len(i) / len(table)
+
+
+def _centred(table, truth, zero, n):
+    """Take the smooth difference of centring conventions out of a list."""
+    i, j = _pairs(table, truth, zero, 1.0, 0.5)
+    bright = truth['mag'][j] < 20.5
+    i, j = i[bright], j[bright]
+    shift = np.column_stack([table[c][i] - truth[c][j] for c in 'xy'])
+    # A short list cannot tell a cubic.
+    n_terms = 10 if len(i) > 60 else 1
+    terms = cubic(table['x'], table['y'], n)[:, :n_terms]
+    found = robust_fit(terms[i], shift)
+    out = table.copy()
+    for k, c in enumerate('xy'):
+        out[c] = table[c] - terms @ found[:, k]
+    return out
+
+
+def _pairs(table, truth, zero, radius, tolerance):
+    """Match one to one, closest first; return rows of both."""
+    magnitude = zero - 2.5 * np.log10(np.maximum(table['flux'], 1e-9))
+    trees = [cKDTree(np.column_stack([t['x'], t['y']]))
+             for t in (table, truth)]
+    near = trees[0].sparse_distance_matrix(trees[1], radius,
+                                           output_type='coo_matrix')
+    alike = np.abs(magnitude[near.row] - truth['mag'][near.col]) < tolerance
+    order = np.argsort(near.data[alike])
+    i, j = near.row[alike][order], near.col[alike][order]
+    used = np.zeros(len(table), bool), np.zeros(len(truth), bool)
+    keep = np.zeros(len(i), bool)
+    for k, (a, b) in enumerate(zip(i, j, strict=True)):
+        keep[k] = not (used[0][a] or used[1][b])
+        if keep[k]:
+            used[0][a] = used[1][b] = True
+    return i[keep], j[keep]
+
+
+def _bound(crowd, truth):
+    """Return the median error a lone star must have [pix]."""
+    scene = crowd.scene
+    base = (scene.background + scene.instrument.dark_level
+            + scene.instrument.readout_variance)
+    result = cramer_rao(crowd.one.models['field'], flux=truth['flux'],
+                        sky=base, x=truth['x'], y=truth['y'], fit_shape=11)
+    # The median of the length of two normal numbers of equal width.
+    width = np.sqrt((result.x_err**2 + result.y_err**2) / 2)
+    return np.sqrt(2 * np.log(2)) * width
+
+
+# Figures
+
+def draw_field(tables):
+    """Draw Fig. 13: magnitudes, the image, a part of it."""
+    scene = tables['crowd']().scene
+    canvas = Canvas(figsize=(11, 3.8), layout='constrained')
+    left, middle, right = canvas.subplots(1, 3)
+    mag = scene.truth['mag'].value[scene.truth['inside']]
+    left.hist(mag, np.arange(16, 26.1, 0.25), histtype='stepfilled',
+              color=COLOURS[0])
+    left.set(yscale='log', xlabel='g [mag]', ylabel='stars per 0.25 mag')
+    stretched = np.arcsinh((scene.image - scene.background) / 10)
+    part = min(200, len(stretched) // 2)
+    for ax, image in ((middle, stretched), (right, stretched[:part, :part])):
+        shown = ax.imshow(image, origin='lower', cmap='cividis', vmin=-0.5,
+                          vmax=7)
+        ax.set(xlabel='x [pix]', ylabel='y [pix]')
+    canvas.colorbar(shown, ax=right, label='arcsinh(electrons / 10)')
+    return canvas
+
+
+def compare_field(tables):
+    """Compare the density."""
+    scene = tables['crowd']().scene
+    count = int(np.sum(scene.truth['inside']))
+    return [Comparison('stars per pixel', f'{5.4e6 / (9216 * 9232):.4f}',
+                       f'{count / scene.image.size:.4f}'),
+            Comparison('pixels', '9216 x 9232',
+                       ' x '.join(map(str, scene.image.shape)))]
+
+
+def draw_errors(tables):
+    """Draw Fig. 14: errors of positions of all methods."""
+    table = tables['errors']
+    canvas = Canvas(figsize=(11, 4.8), layout='constrained')
+    left, right = canvas.subplots(1, 2)
+    names = list(dict.fromkeys(table['method']))
+    for k, name in enumerate(names):
+        part = table[table['method'] == name]
+        style = {'color': COLOURS[k % len(COLOURS)], 'label': name,
+                 'linewidth': 2.5 if name == OURS else 1}
+        mark = f'{MARKS[k % len(MARKS)]}-'
+        left.plot(part['mag'], part['median_error'], mark, **style)
+        right.plot(part['mag'], 100 * part['completeness'], mark, **style)
+    left.plot(part['mag'], part['bound'], 'k:',
+              label='bound of a lone star')
+    left.set(yscale='log', xlabel='g [mag]',
+             ylabel='median error of position [mas]')
+    right.set(xlabel='g [mag]', ylabel='stars found [%]')
+    left.legend(fontsize=7)
+    return canvas
+
+
+def compare_errors(tables):
+    """Compare with the best mode of SExtractor, on the same stars."""
+    table = tables['errors']
+    modes = [name for name in SEXTRACTOR if name in table['method']]
+    if not modes:
+        return [Comparison('error over that of the best mode of SExtractor',
+                           'below 1 for stars fainter than 21 mag',
+                           'SExtractor is not installed')]
+    lines = []
+    for middle in np.unique(table['mag'].value):
+        here = table[table['mag'].value == middle]
+        some = here[np.isin(here['method'], modes)
+                    & np.isfinite(here['median_error'].value)]
+        if len(some):
+            lines.append(_line(middle, here, some))
+    return lines
+
+
+def _line(middle, here, some):
+    """Compare one magnitude."""
+    best = some[np.argmin(some['median_error'])]
+    alone = here[here['method'] == 'star by star, K = 3'][0]
+    peer = best['median_error'].value
+    ours = best['crowded_same_stars'].value
+    faint = middle > 21
+    verdict = ''
+    if faint:
+        verdict = 'reached' if ours < peer else 'worse than SExtractor'
+    return Comparison(
+        f'{middle:.1f} mag: {OURS}, K = 3 star by star; {best["method"]}, '
+        'the best of SExtractor',
+        'smaller than SExtractor' if faint else 'SExtractor WIN similar',
+        f'{ours:.2f} mas, {alone["median_error"].value:.2f} mas; '
+        f'{peer:.2f} mas', verdict)
+
+
+GROUPS = (Group('crowded', measure, (
+    Figure('fig13', 'Fig. 13: the crowded field',
+           'The density of the paper, with the luminosity function that '
+           '``crowded_field`` states in place of the Galaxy model of the '
+           'paper.', draw_field, compare_field),
+    Figure('fig14', 'Fig. 14: centring in the crowded field',
+           'Medians of the distance from the truth, of the stars that each '
+           'method found; on the right the share of stars it found. The '
+           'PSFs of all methods are made from the sparse exposure of the '
+           'same detector, none is the true one. The smooth difference of '
+           'centring conventions is taken out of every list. In the lines '
+           'below, the error of the crowded fit is that for the stars '
+           'SExtractor found, too.', draw_errors, compare_errors))),)

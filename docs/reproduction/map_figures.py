@@ -1,0 +1,174 @@
+"""Size and ellipticity over the detectors: Figs. 4 to 7."""
+from contextlib import suppress
+
+import numpy as np
+from astropy.table import QTable, vstack
+from matplotlib.figure import Figure as Canvas
+from peers import AbsentError, absent, psfex
+from scenes import detector, forget
+from settings import BANDS
+from store import Comparison, Figure, Group
+
+from photutils_mgauss import assess_psf
+
+ERRORS = {'size_error': r'$\delta(R^2)/R^2$',
+          'ellipticity_error': r'$\delta\epsilon$'}
+
+# What is compared with what, and in which places.
+PAIRS = {
+    'empirical': 'empirical PSF against the true PSF',
+    'psfex': 'PSFEx against the true PSF',
+    'chain': 'three Gaussians against the empirical PSF, at the nodes',
+    'blend': 'blend of four nodes against the empirical PSF, mid-cell',
+    'field': 'mixture field, K = 5, against the true PSF',
+    'chain_truth': 'three Gaussians against the true PSF, at the nodes',
+}
+
+
+def measure(run):
+    """Return the errors at the places of all detectors, and a summary."""
+    parts = [run.table(f'maps_{number:02d}',
+                       lambda number=number: _measure(run, number),
+                       keep=False) for number in run.settings.detectors]
+    maps = run.table('fig4_to_7_maps', lambda: _joined(parts))
+    if np.isnan(maps['psfex_size_error']).all():
+        run.skipped.setdefault('PSFEx', str(absent('PSFEx')))
+    return {'maps': maps, 'summary': run.table(
+        'fig4_to_7_summary', lambda: _summary(maps))}
+
+
+def _joined(parts):
+    for part in parts:
+        part.meta.clear()
+    return vstack(parts)
+
+
+def _measure(run, number):
+    """Return a row for each place of a detector."""
+    one = detector(run, number)
+    size, grid = run.settings.size, run.settings.grid
+    columns = {f'{name}_{error}': np.full(grid**2, np.nan)
+               for name in PAIRS for error in ERRORS}
+    for name, (model, truth, mid_cell) in _pairs(run, one).items():
+        found = assess_psf(model, truth, (grid, grid), shape=(size, size),
+                           oversampling=2, mid_cell=mid_cell)
+        for error in ERRORS:
+            columns[f'{name}_{error}'][:len(found.table)] = (
+                found.table[error])
+    forget(size)
+    x, y = (a.ravel() for a in np.meshgrid(*[np.arange(grid)] * 2))
+    return QTable({'detector': np.full(grid**2, number),
+                   'band': np.full(grid**2, one.band), 'column': x, 'row': y,
+                   **columns})
+
+
+def _pairs(run, one):
+    """Return (model, truth, whether mid-cell) by name."""
+    pairs = {'empirical': (one.empirical.image_at, one.true_image, False),
+             'chain': (one.chain, one.empirical.image_at, False),
+             'blend': (one.chain, one.empirical.image_at, True),
+             'field': (one.field, one.true_image, False),
+             'chain_truth': (one.chain, one.true_image, False)}
+    # PSFEx takes longer than everything else together.
+    if one.number in BANDS:
+        with suppress(AbsentError):
+            path = run.folder / 'partial' / f'{one.number:02d}.psf'
+            model = psfex(one.sparse.image, run.settings.degree, path)
+            pairs['psfex'] = (model.image_at, one.true_image, False)
+    return pairs
+
+
+def _summary(maps):
+    """Return median, scatter and mean of each error on each detector."""
+    rows = []
+    for number in np.unique(maps['detector']):
+        part = maps[maps['detector'] == number]
+        for name in PAIRS:
+            for error in ERRORS:
+                values = np.asarray(part[f'{name}_{error}'])
+                if np.isfinite(values).any():
+                    rows.append((int(number), part['band'][0], name, error,
+                                 np.nanmedian(values), np.nanmean(values),
+                                 np.nanstd(values)))
+    return QTable(rows=rows, names=('detector', 'band', 'compared', 'error',
+                                    'median', 'mean', 'standard_deviation'))
+
+
+def draw(name, error, tables):
+    """Draw one map for each detector, with the same colours."""
+    maps = tables['maps']
+    numbers = np.unique(maps['detector'])
+    columns = min(6, len(numbers))
+    rows = -(-len(numbers) // columns)
+    canvas = Canvas(figsize=(2 * columns + 1.2, 2.1 * rows + 0.6),
+                    layout='constrained')
+    axes = np.ravel(canvas.subplots(rows, columns, squeeze=False))
+    limit = np.nanpercentile(np.abs(maps[f'{name}_{error}']), 98)
+    for ax, number in zip(axes, numbers, strict=False):
+        part = maps[maps['detector'] == number]
+        values = np.asarray(part[f'{name}_{error}'])
+        side = int(np.sqrt(len(values)))
+        shown = ax.imshow(values.reshape(side, side), origin='lower',
+                          cmap='RdBu_r', vmin=-limit, vmax=limit)
+        ax.set(xticks=[], yticks=[])
+        ax.set_title(f'#{number:02d} {part["band"][0]}: '
+                     f'{np.nanmedian(values):+.4f} $\\pm$ '
+                     f'{np.nanstd(values):.4f}', fontsize=7)
+    for ax in axes[len(numbers):]:
+        ax.set_axis_off()
+    canvas.colorbar(shown, ax=list(axes), label=ERRORS[error])
+    canvas.supxlabel('x of the detector', fontsize=9)
+    canvas.supylabel('y of the detector', fontsize=9)
+    return canvas
+
+
+def compare(names, error, tables):
+    """Return a line for each comparison, over all detectors."""
+    found = {name: np.asarray(tables['maps'][f'{name}_{error}'])
+             for name in names}
+    found = {name: values for name, values in found.items()
+             if np.isfinite(values).any()}
+    return [Comparison(
+        f'{PAIRS[name]}: median +- standard deviation',
+        'in the titles of the figure only',
+        f'{np.nanmedian(values):+.4f} +- {np.nanstd(values):.4f}',
+        _judgement(name, values, found.get('psfex')))
+        for name, values in found.items()]
+
+
+def _judgement(name, values, psfex):
+    """Say how a PSF made of the same image compares with that of PSFEx."""
+    if psfex is None or name == 'psfex':
+        return ''
+    both = np.isfinite(psfex)
+    ratio = np.nanstd(values[both]) / np.nanstd(psfex[both])
+    word = 'better' if ratio < 1 else 'worse'
+    return (f'{word}: {ratio:.2f} times the scatter of PSFEx on the same '
+            'detectors')
+
+
+def _figure(key, error, name, others, text):
+    what = {'size_error': 'dR2/R2', 'ellipticity_error': 'd-epsilon'}[error]
+    title = f'Fig. {key[3:]}: {what} of {text}'
+    return Figure(
+        key, title,
+        'The sign is that of the paper, truth minus model; titles give the '
+        'median and the standard deviation over the places of a detector. '
+        'The colours of all panels are the same. PSFEx is run on the '
+        'detectors of Table 2, where it chooses its own stars, as many as '
+        'it likes.',
+        lambda tables: draw(name, error, tables),
+        lambda tables: compare((name, *others), error, tables))
+
+
+_OVER_TRUTH = ('psfex', 'field')
+_OVER_EMPIRICAL = ('blend', 'chain_truth')
+GROUPS = (Group('maps', measure, (
+    _figure('fig4', 'size_error', 'empirical', _OVER_TRUTH,
+            'the empirical PSF'),
+    _figure('fig5', 'ellipticity_error', 'empirical', _OVER_TRUTH,
+            'the empirical PSF'),
+    _figure('fig6', 'size_error', 'chain', _OVER_EMPIRICAL,
+            'three Gaussians'),
+    _figure('fig7', 'ellipticity_error', 'chain', _OVER_EMPIRICAL,
+            'three Gaussians'))),)

@@ -1,0 +1,247 @@
+"""The PSF, its Gaussians, their posterior: Figs. 1-3, Appendices A, B."""
+import numpy as np
+from astropy.table import QTable
+from matplotlib.figure import Figure as Canvas
+from scenes import detector
+from settings import PIXEL, STAMP_RADIUS
+from store import COLOURS, Comparison, Figure, Group
+
+from photutils_mgauss import (
+    MixturePosterior,
+    compare_n_components,
+    fit_mixture,
+    sample_mixture,
+)
+from photutils_mgauss.plotting import (
+    plot_comparison_of_numbers,
+    plot_ellipses,
+    plot_model_graph,
+    plot_posterior,
+    plot_profile,
+    plot_projection,
+    plot_trace,
+)
+
+FIT = {'oversampling': 2, 'radius': STAMP_RADIUS}
+HALF = 15  # of the stamp that is fitted, 31 samples of 0.037 arcsec across
+PARAMETERS = ('omega', 'alpha', 'beta', 'gamma', 'sigma')
+
+
+def measure(run):
+    """Return the empirical PSF in the middle of detector 8, and its fits."""
+    image = run.table('fig1_psf', lambda: _stamp(run))
+    stamp = cut(image['sample'])
+    return {
+        'image': image,
+        'components': run.table('fig3_components',
+                                lambda: _components(stamp)),
+        'numbers': run.table('appendix_b_numbers', lambda: _numbers(stamp))}
+
+
+def _stamp(run):
+    middle = (run.settings.size - 1) / 2
+    image = detector(run, 8).empirical.image_at(middle, middle)
+    return QTable({'sample': image})
+
+
+def cut(image):
+    """Return the inner part of the image of the PSF."""
+    image = np.asarray(image)
+    c = len(image) // 2
+    return image[c - HALF:c + HALF + 1, c - HALF:c + HALF + 1]
+
+
+def _components(stamp):
+    fit = fit_mixture(stamp, 3, **FIT)
+    mixture = fit.mixture
+    return QTable({
+        'weight': mixture.weights, 'x_mean': mixture.means[:, 0],
+        'y_mean': mixture.means[:, 1], 'x_stddev': mixture.stddevs[:, 0],
+        'y_stddev': mixture.stddevs[:, 1], 'rho': mixture.rho})
+
+
+def _numbers(stamp):
+    table = compare_n_components(stamp, (1, 2, 3, 4, 5), **FIT)
+    table.meta.clear()
+    return table
+
+
+def enclosed(image, radius):
+    """Return the share of an image's flux within a radius [native pix]."""
+    steps = (np.arange(len(image)) - len(image) // 2) / 2
+    return image[np.hypot(steps, steps[:, None]) <= radius].sum() / image.sum()
+
+
+def draw_image(tables):
+    """Draw Fig. 1: projections of the whole PSF and of the cut one."""
+    image = np.asarray(tables['image']['sample'])
+    steps = (np.arange(len(image)) - len(image) // 2) / 2
+    inner = np.hypot(steps, steps[:, None]) <= STAMP_RADIUS
+    canvas = Canvas(figsize=(9, 6), layout='constrained')
+    axes = canvas.subplots(2, 2, sharex=True)
+    for column, (shown, name) in enumerate((
+            (image, 'whole'), (np.where(inner, image, 0), 'within 1.1"'))):
+        for row, axis in enumerate('xy'):
+            ax = axes[row, column]
+            values = shown.sum(axis=row) / image.sum()
+            ax.fill_between(steps * PIXEL, values, step='mid',
+                            color=COLOURS[row])
+            ax.set(xlabel=f'{axis} [arcsec]', ylabel='share of the flux',
+                   title=f'{name}, projected on {axis}')
+    return canvas
+
+
+def compare_image(tables):
+    """Compare the flux within 1.1 arcsec."""
+    share = enclosed(np.asarray(tables['image']['sample']), STAMP_RADIUS)
+    return [Comparison('flux within a circle of 1.1" across, of that in the '
+                       'stamp', '98 %', f'{share:.1%}'.replace('%', ' %'))]
+
+
+def draw_graph(tables):
+    """Draw Fig. 2: the Bayesian model."""
+    canvas = Canvas(figsize=(9, 3.5), layout='constrained')
+    side = len(cut(tables['image']['sample']))
+    plot_model_graph(canvas.subplots(), 3, (side, side))
+    return canvas
+
+
+def draw_components(tables):
+    """Draw Fig. 3: the profile and its Gaussians, linear and logarithmic."""
+    stamp = cut(tables['image']['sample'])
+    fit = fit_mixture(stamp, 3, **FIT)
+    canvas = Canvas(figsize=(9, 7.5), layout='constrained')
+    axes = canvas.subplots(2, 2)
+    for ax, axis in zip(axes[0], 'xy', strict=True):
+        plot_projection(ax, fit, stamp, axis=axis, oversampling=2)
+    plot_profile(axes[1, 0], fit, stamp)
+    plot_ellipses(axes[1, 1], fit.mixture)
+    axes[0, 0].set_title('(a) projection on x')
+    axes[0, 1].set_title('(a) projection on y')
+    axes[1, 0].set_title('(b) brightest row')
+    axes[1, 1].set_title('the Gaussians, one sigma')
+    return canvas
+
+
+def compare_components(tables):
+    """Compare the shares of the Gaussians."""
+    weights = np.sort(tables['components']['weight'])[::-1]
+    words = ', '.join(f'{100 * w:.0f} %' for w in weights)
+    return [Comparison('share of the strongest Gaussian', '80 %',
+                       f'{100 * weights[0]:.0f} %'),
+            Comparison('shares of all three', '80 %, the others 20 %', words)]
+
+
+def draw_numbers(tables):
+    """Draw Appendix B: residuals for one, three and five Gaussians."""
+    stamp = cut(tables['image']['sample'])
+    table = compare_n_components(stamp, (1, 3, 5), **FIT)
+    canvas = Canvas(figsize=(11, 3.2), layout='constrained')
+    axes = canvas.subplots(1, 4)
+    plot_comparison_of_numbers(axes, stamp, table)
+    canvas.colorbar(axes[1].images[0], ax=list(axes),
+                    label='residual / peak')
+    return canvas
+
+
+def compare_numbers(tables):
+    """Say what more Gaussians give."""
+    rows = {int(row['n_components']): row for row in tables['numbers']}
+    lines = [Comparison(
+        f'K = {k}: dR2/R2, d-epsilon, largest residual / peak, time',
+        {1: 'inadequate', 3: 'chosen', 5: 'may overfit'}[k],
+        f'{rows[k]["r2_error"]:+.4f}, {rows[k]["ellipticity_error"]:+.4f}, '
+        f'{rows[k]["max_residual"]:.4f}, {1e3 * rows[k]["time"]:.0f} ms')
+        for k in (1, 3, 5)]
+    better = (abs(rows[5]['r2_error']) < abs(rows[3]['r2_error'])
+              and rows[5]['max_residual'] < rows[3]['max_residual'])
+    word = ('not seen: K = 5 is closer in size and residual' if better
+            else 'seen here, too')
+    return [*lines, Comparison('overfitting with K = 5',
+                               'size and ellipticity get worse', word)]
+
+
+def measure_posterior(run):
+    """Return the draws of the posterior of the same stamp, and a summary."""
+    image = run.table('fig1_psf', lambda: _stamp(run))
+    made = []
+
+    def sample():
+        if not made:
+            made.append(_sample(run, cut(image['sample'])))
+        return made[0]
+    return {'draws': run.table('appendix_a_draws', lambda: _draws(sample())),
+            'summary': run.table('appendix_a_summary',
+                                 lambda: sample().summary())}
+
+
+def _sample(run, stamp):
+    draws = run.settings.draws
+    return sample_mixture(stamp, 3, prior='paper', pixel_scale=PIXEL,
+                          draws=draws, tune=draws, chains=2, cores=1,
+                          random_seed=1, **FIT)
+
+
+def _draws(posterior):
+    """Return every second draw of each chain, one row for each."""
+    return QTable({name: np.moveaxis(getattr(posterior, name), 0, 1)[::2]
+                   for name in (*PARAMETERS, 'flux')})
+
+
+def draw_posterior(tables):
+    """Draw Appendix A: distributions and traces of the parameters."""
+    draws = {name: np.moveaxis(np.asarray(tables['draws'][name]), 0, 1)
+             for name in (*PARAMETERS, 'flux')}
+    posterior = MixturePosterior(**draws, fit=None, idata=None)
+    canvas = Canvas(figsize=(11, 14), layout='constrained')
+    for name, (left, right) in zip(PARAMETERS, canvas.subplots(5, 2),
+                                   strict=True):
+        left.set_prop_cycle(color=COLOURS)
+        plot_posterior(left, posterior, name)
+        plot_trace(right, posterior, name)
+        label = f'{name} [pix]' if name in ('alpha', 'beta') else name
+        left.set_xlabel(label)
+        right.set(xlabel='every second draw', ylabel=label)
+        left.locator_params(axis='x', nbins=6)
+        for ax in (left, right):
+            ax.legend(fontsize=6, ncols=2)
+    return canvas
+
+
+def compare_posterior(tables):
+    """Say whether the chains agree."""
+    worst = float(np.nanmax(tables['summary']['r_hat']))
+    return [Comparison('largest r-hat of all parameters', 'not given',
+                       f'{worst:.3f}')]
+
+
+GROUPS = (
+    Group('psf', measure, (
+        Figure('fig1', 'Fig. 1: the PSF and its cut',
+               'The empirical PSF in the middle of detector 8, made of stars '
+               'of a simulated exposure by ``EmpiricalPSF``, and the part of '
+               'it that is fitted.', draw_image, compare_image),
+        Figure('fig2', 'Fig. 2: the Bayesian model',
+               'The parameters and their priors as ``sample_mixture`` has '
+               'them. The stamp has 31 samples a side, where the paper has '
+               '30, so that the star is in the middle of one.', draw_graph),
+        Figure('fig3', 'Fig. 3: profile and components',
+               'Three Gaussians fitted to that stamp by ``fit_mixture``. '
+               'Shares depend on the aberrations: where coma is strong, as '
+               'in the middle of this detector, the core takes more than one '
+               'Gaussian.',
+               draw_components, compare_components),
+        Figure('appendix_b', 'Appendix B: the number of Gaussians',
+               'Residuals for one, three and five Gaussians, by '
+               '``compare_n_components``; time is that of one least-squares '
+               'fit. One Gaussian has the size and ellipticity of the image '
+               'by construction, because adaptive moments are those of the '
+               'Gaussian that matches it best: what it lacks shows in the '
+               'residual only.', draw_numbers, compare_numbers))),
+    Group('posterior', measure_posterior, (
+        Figure('appendix_a', 'Appendix A: the posterior',
+               'Draws of ``sample_mixture`` with the priors of the paper: '
+               'distributions on the left, traces of two chains on the '
+               'right. Lengths are in pixels from the centre of the stamp.',
+               draw_posterior, compare_posterior),)),
+)

@@ -1,0 +1,100 @@
+"""The background of a tile of a crowded field: a mesh of nodes."""
+import numpy as np
+
+from photutils_mgauss._local_psf import cells
+
+# How strongly neighbouring nodes are tied, in units of a node's information.
+_TIE = 1e-3
+
+
+class Mesh:
+    """
+    Nodes of a bilinear background, at multiples of the spacing.
+
+    A node is the mean of the sky over the pixels nearest to it, so that it
+    depends on nothing further away. Levels are flat, ordered by y, then x.
+
+    Parameters
+    ----------
+    shape, origin : (y, x) tuple of int
+        The pixels of the tile, and where in the image its first one is.
+    spacing : float
+        The distance of nodes [pix].
+    """
+
+    def __init__(self, shape, origin, spacing):
+        self.y, self.x = (_lattice(first, n, spacing) - first
+                          for first, n in zip(origin, shape, strict=True))
+        self.shape = self.y.size, self.x.size
+        pixels = [np.arange(float(n)) for n in shape]
+        self._rows, self._columns = (
+            cells(p, nodes) for p, nodes in zip(pixels, (self.y, self.x),
+                                                strict=True))
+        self._owner = [np.searchsorted((nodes[1:] + nodes[:-1]) / 2, p,
+                                       side='right')
+                       for p, nodes in zip(pixels, (self.y, self.x),
+                                           strict=True)]
+        self.ties = _TIE * spacing**2 * _differences(*self.shape)
+
+    def image(self, level):
+        """Return the background (ny, nx) of levels (n,)."""
+        level = level.reshape(self.shape)
+        row, passed = self._rows
+        passed = passed[:, None]
+        level = (1 - passed) * level[row] + passed * level[row + 1]
+        column, passed = self._columns
+        return (1 - passed) * level[:, column] + passed * level[:, column + 1]
+
+    def sums(self, image):
+        """Return the sum (n,) of an image over each node's pixels."""
+        for axis, owner in enumerate(self._owner):
+            # The last node of a small tile may own nothing.
+            seen, start = np.unique(owner, return_index=True)
+            total = np.add.reduceat(image, start, axis=axis)
+            shape = list(total.shape)
+            shape[axis] = self.shape[axis]
+            image = np.zeros(shape)
+            image[(slice(None),) * axis + (seen,)] = total
+        return image.ravel()
+
+    def faint_level(self, data, good):
+        """Return the faint percentile (n,) of each node's good pixels."""
+        out = np.full(self.shape, np.nan)
+        for j, i in np.ndindex(self.shape):
+            part = np.ix_(self._owner[0] == j, self._owner[1] == i)
+            seen = data[part][good[part]]
+            if seen.size:
+                out[j, i] = np.percentile(seen, 20)
+        known = np.isfinite(out)
+        return np.where(known, out, np.median(out[known])).ravel()
+
+    def shares(self, x, y):
+        """Return the four nodes around positions and their shares (n, 4)."""
+        n = self.x.size
+        column, fx = cells(x, self.x)
+        row, fy = cells(y, self.y)
+        node = (row * n + column)[:, None] + np.array([0, 1, n, n + 1])
+        share = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy,
+                          fx * fy], axis=1)
+        return node, share
+
+
+def _lattice(first, size, spacing):
+    """Return the multiples of spacing that are nearest to a pixel."""
+    low = np.floor(first / spacing + 0.5)
+    high = max(np.floor((first + size - 1) / spacing + 0.5), low + 1)
+    return np.arange(low, high + 1) * float(spacing)
+
+
+def _differences(ny, nx):
+    """Return the matrix of the sum of squared differences of neighbours."""
+    number = np.arange(ny * nx).reshape(ny, nx)
+    out = np.zeros((ny * nx, ny * nx))
+    pairs = ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1]))
+    for after, before in pairs:
+        a, b = after.ravel(), before.ravel()
+        np.add.at(out, (a, a), 1)
+        np.add.at(out, (b, b), 1)
+        out[a, b] -= 1
+        out[b, a] -= 1
+    return out

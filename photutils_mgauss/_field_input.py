@@ -1,0 +1,234 @@
+"""Stars of one or more exposures, as the fit of a field wants them."""
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.table import QTable, Table
+from astropy.utils.exceptions import AstropyUserWarning
+
+from photutils_mgauss import _field_stages as stages
+from photutils_mgauss._field_choice import DEGREES
+from photutils_mgauss._field_fit import Problem
+from photutils_mgauss._field_forms import FreeShapes
+from photutils_mgauss._star_stamps import (
+    Stamps,
+    cut_stamps,
+    remove_star_noise,
+)
+from photutils_mgauss._tables import as_image, read_sources
+
+# Neighbours may be this far off their catalogue positions [pix].
+_NEIGHBOUR_STDDEV = 0.5
+_MAX_NEIGHBOURS = 12
+# Stars needed for each term of the polynomials, beyond the first.
+_STARS_PER_TERM = 2
+
+
+@dataclass
+class Sample:
+    """
+    The stars of all exposures that can be used.
+
+    Attributes
+    ----------
+    stamps : Stamps
+    sources : (n, M, 3) `~numpy.ndarray`
+        x, y and flux of each star and its neighbours.
+    count : (n,) `~numpy.ndarray` of int
+        How many of those there are.
+    exposure, row : (n,) `~numpy.ndarray` of int
+        The exposure of each star, and its row in the table of that.
+    reasons : list of `~numpy.ndarray` of str
+        For each exposure and row why it is not used, or ''.
+    shape : (int, int)
+        Of the detector.
+    catalogues : list of Sources
+        As given.
+    """
+
+    stamps: Stamps
+    sources: np.ndarray
+    count: np.ndarray
+    exposure: np.ndarray
+    row: np.ndarray
+    reasons: list
+    shape: tuple
+    catalogues: list
+
+    def expected(self):
+        """Return x and y (n,) of the stars in their tables."""
+        places = [(self.catalogues[e].x[i], self.catalogues[e].y[i])
+                  for e, i in zip(self.exposure, self.row, strict=True)]
+        return np.array(places).T
+
+    def problem(self, degree, local_bkg):
+        """Return the problem of a field with polynomials of a degree."""
+        x, y = self.expected()
+        basis = stages.polynomials(*normalised(x, y, self.shape), degree)
+        hold = np.full(self.sources.shape, _NEIGHBOUR_STDDEV**-2.0)
+        hold[..., 2] = 1 / np.maximum(self.sources[..., 2] ** 2, 1e-300)
+        n = len(x)
+        return Problem(self.stamps, np.zeros(self.stamps.data.shape), basis,
+                       self.sources, self.sources.copy(), hold, self.count,
+                       np.zeros(n), bool(local_bkg), np.ones(n, bool),
+                       self.exposure, FreeShapes(), np.zeros((n, 3)))
+
+    def dropped(self):
+        """Return the table of what was not used, and why."""
+        rows = [np.flatnonzero(one != '') for one in self.reasons]
+        table = QTable({'id': np.concatenate(rows) + 1, 'reason':
+                        np.concatenate([one[i] for one, i in zip(
+                            self.reasons, rows, strict=True)])})
+        if len(rows) > 1:
+            table['exposure'] = np.repeat(np.arange(len(rows)),
+                                          [one.size for one in rows])
+        return table
+
+
+def normalised(x, y, shape):
+    """Return positions scaled to [-1, 1] over the detector."""
+    ny, nx = shape
+    return (2 * np.asarray(x, float) / max(nx - 1, 1) - 1,
+            2 * np.asarray(y, float) / max(ny - 1, 1) - 1)
+
+
+def read_sample(data, stars, error, mask, radius, gain):
+    """Check the exposures, cut their stars out, and say who is left out."""
+    exposures = list(_exposures(data, stars, error, mask))
+    parts = [_read_one(*one, radius, gain) for one in exposures]
+    stamps = Stamps.joined([part[0] for part in parts])
+    if not len(stamps.data):
+        msg = (f'stars must hold at least 1 star whose pixels can be used, '
+               f'got none of {sum(part[2].x.size for part in parts)}: they '
+               f'are outside the image, masked, or too near the edge')
+        raise ValueError(msg)
+    most = max(part[4].shape[1] for part in parts)
+    return Sample(
+        stamps, np.concatenate([
+            np.pad(part[4], ((0, 0), (0, most - part[4].shape[1]), (0, 0)))
+            for part in parts]),
+        np.concatenate([part[5] for part in parts]),
+        np.repeat(np.arange(len(parts)), [len(part[1]) for part in parts]),
+        np.concatenate([part[1] for part in parts]),
+        [part[3] for part in parts], exposures[0][0].shape,
+        [part[2] for part in parts])
+
+
+def _exposures(data, stars, error, mask):
+    """Yield the checked images and the table of each exposure."""
+    if isinstance(stars, Table) or not isinstance(stars, (list, tuple)):
+        yield (*_images(data, error, mask), stars)
+        return
+    lists = {'data': data, 'error': error, 'mask': mask}
+    for name, one in lists.items():
+        if one is None:
+            lists[name] = [None] * len(stars)
+        elif len(one) != len(stars):
+            msg = (f'{name} must hold an image for each of the {len(stars)} '
+                   f'tables in stars, got {len(one)}')
+            raise ValueError(msg)
+    if not stars:
+        msg = 'stars must hold at least 1 table, got none'
+        raise ValueError(msg)
+    shape = np.shape(data[0])
+    for *given, table in zip(*lists.values(), stars, strict=True):
+        images = _images(*given)
+        if images[0].shape != shape:
+            msg = (f'data must be exposures of one detector, got the shapes '
+                   f'{shape} and {images[0].shape}')
+            raise ValueError(msg)
+        yield (*images, table)
+
+
+def _images(data, error, mask):
+    data = as_image(data, 'data')
+    if error is not None:
+        error = as_image(error, 'error', data.shape)
+    if mask is not None:
+        mask = as_image(mask, 'mask', data.shape).astype(bool)
+    return data, error, mask
+
+
+def _read_one(data, error, mask, table, radius, gain):
+    """Return stamps, their rows, sources, reasons, neighbours, counts."""
+    sources = read_sources(table)
+    stamps, rows, reasons = _usable_stamps(data, error, mask, sources, radius,
+                                           gain)
+    around, count = _with_neighbours(sources, rows, stamps)
+    return stamps, rows, sources, reasons, around, count
+
+
+def _usable_stamps(data, error, mask, sources, radius, gain):
+    """Return stamps of usable stars, their rows, and why others are not."""
+    reasons = np.full(sources.x.size, '', dtype='U12')
+    ny, nx = data.shape
+    with np.errstate(invalid='ignore'):
+        inside = ((np.abs(sources.x - (nx - 1) / 2) <= nx / 2)
+                  & (np.abs(sources.y - (ny - 1) / 2) <= ny / 2))
+    reasons[~inside] = 'outside'
+    rows = np.flatnonzero(inside & sources.selected)
+    stamps = cut_stamps(data, error, mask, sources.x[rows], sources.y[rows],
+                        radius)
+    if error is None:
+        _estimate_noise(stamps, data)
+    usable = stamps.usable()
+    reasons[rows[~usable]] = 'masked'
+    stamps = stamps.subset(usable)
+    if error is not None and usable.any():
+        remove_star_noise(stamps, gain)
+    return stamps, rows[usable], reasons
+
+
+def _estimate_noise(stamps, data):
+    """Set the variance to that of the image away from stars, in place."""
+    from astropy.stats import mad_std
+    stamps.base[:] = max(mad_std(data, ignore_nan=True) ** 2,
+                         np.finfo(float).tiny)
+
+
+def _with_neighbours(sources, index, stamps):
+    """Return x, y, flux of each star and its neighbours, and their number."""
+    from scipy.spatial import KDTree
+    flux = sources.flux.copy()
+    known = np.isfinite(sources.x) & np.isfinite(sources.y)
+    inner = stamps.offsets() <= 3.5
+    flux[index] = np.where(
+        flux[index] > 0, flux[index],
+        np.maximum((stamps.data * inner).sum(axis=(1, 2)), 1e-3))
+    known &= np.isfinite(flux) & (flux > 0)
+    known_rows = np.flatnonzero(known)
+    tree = KDTree(np.column_stack([sources.x, sources.y])[known])
+    lists = []
+    for star in index:
+        here = sources.x[star], sources.y[star]
+        near = known_rows[tree.query_ball_point(here, stamps.radius + 2)]
+        near = near[near != star]
+        brightest = near[np.argsort(-flux[near])][:_MAX_NEIGHBOURS]
+        lists.append([star, *brightest])
+    count = np.array([len(rows) for rows in lists], int)
+    table = np.zeros((len(index), count.max(initial=1), 3))
+    for i, rows in enumerate(lists):
+        table[i, :len(rows)] = np.column_stack(
+            [sources.x[rows], sources.y[rows], flux[rows]])
+    return table, count
+
+
+def possible_degree(degree, n_stars):
+    """Return the highest degree to try; warn if a lower one must do."""
+    if degree == 'auto':
+        # A third of the stars is left out while the degree is chosen.
+        return max(d for d in DEGREES
+                   if d == 0 or 2 * n_stars // 3 >= _stars_needed(d))
+    needed = _stars_needed(degree)
+    if n_stars >= needed:
+        return degree
+    possible = max(d for d in range(degree) if n_stars >= _stars_needed(d))
+    warnings.warn(
+        f'{n_stars} stars are too few for degree {degree}, which needs '
+        f'{needed}; degree {possible} is used', AstropyUserWarning,
+        stacklevel=3)
+    return possible
+
+
+def _stars_needed(degree):
+    return 1 + _STARS_PER_TERM * (stages.n_terms(degree) - 1)

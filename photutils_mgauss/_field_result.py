@@ -1,0 +1,127 @@
+"""What all fields have in common, and the tables they report."""
+import numpy as np
+from astropy.table import QTable
+
+from photutils_mgauss._field_fit import model_stamps, to_vector
+from photutils_mgauss._field_forms import mixture_arrays
+from photutils_mgauss._validation import as_real
+
+
+class Field:
+    """A PSF that varies over a detector; ``mixture_at`` gives it."""
+
+    def enclosed_flux(self, x, y):
+        """
+        Return the share of the PSF's flux inside the fitted circle.
+
+        Parameters
+        ----------
+        x, y : float
+            The position [pix].
+
+        Returns
+        -------
+        float
+        """
+        return self.mixture_at(x, y).encircled_energy(self.radius)
+
+    def aperture_correction(self, radius, x, y):
+        """
+        Return the factor from the flux in an aperture to that of the PSF.
+
+        Beyond ``self.radius`` the wings are those of the Gaussians, which no
+        pixel has confirmed: to tie fluxes to a larger aperture, compare the
+        two with bright stars.
+
+        Parameters
+        ----------
+        radius : float
+            The radius of the aperture [pix].
+        x, y : float
+            The position [pix].
+
+        Returns
+        -------
+        float
+        """
+        radius = as_real(radius, 'radius', above=0)
+        return 1 / self.mixture_at(x, y).encircled_energy(radius)
+
+    def plot(self, ax, quantity='size', **options):
+        """
+        Draw the field on the Axes given.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`
+        quantity : {'size', 'ellipticity', 'residual'}, optional
+            See `photutils_mgauss.plotting.plot_field`.
+        **options
+            Its keywords.
+
+        Returns
+        -------
+        `~matplotlib.artist.Artist`
+        """
+        from photutils_mgauss.plotting import plot_field
+        return plot_field(ax, self, quantity, **options)
+
+
+def nodes(n, size):
+    """Return the places of n nodes along an axis of the detector."""
+    return np.linspace(0, size - 1, n) if n > 1 else np.array([(size - 1) / 2])
+
+
+def lattice(grid_shape, shape):
+    """Return x and y of the nodes of a grid over the detector, row by row."""
+    rows, columns = grid_shape
+    return (grid.ravel() for grid in np.meshgrid(
+        nodes(columns, shape[1]), nodes(rows, shape[0])))
+
+
+def covariance_of(fit):
+    """Return the covariance of the fitted coefficients."""
+    return np.linalg.inv(fit.equations.matrix
+                         + np.diag(to_vector(fit.prior.precision)))
+
+
+def residual_stars(fit):
+    """Return data minus model of each star, NaN where nothing was used."""
+    residual = fit.problem.stamps.data - model_stamps(fit.problem,
+                                                      fit.coefficients)
+    residual[fit.problem.weights == 0] = np.nan
+    return residual
+
+
+def star_table(fit, sample):
+    """Return the table of the stars; note in the sample who was deviant."""
+    problem = fit.problem
+    for star in np.flatnonzero(~problem.used):
+        sample.reasons[sample.exposure[star]][sample.row[star]] = 'deviant'
+    n_pixels = (problem.weights > 0).sum(axis=(1, 2))
+    table = QTable()
+    table['id'] = sample.row + 1
+    if len(sample.reasons) > 1:
+        table['exposure'] = sample.exposure
+    table['x'], table['y'] = sample.expected()
+    table['x_fit'], table['y_fit'], table['flux_fit'] = _own_numbers(fit).T
+    table['local_bkg'] = problem.sky
+    table['reduced_chi2'] = fit.equations.chi2 / np.maximum(n_pixels - 3, 1)
+    table['n_pixels_fit'] = n_pixels
+    table['n_pixels_rejected'] = fit.deviant_pixels.sum(axis=(1, 2))
+    table['used'] = problem.used
+    table['reason'] = np.array([
+        sample.reasons[e][i] for e, i in zip(sample.exposure, sample.row,
+                                             strict=True)])
+    return table
+
+
+def _own_numbers(fit):
+    """Return x, y and flux of the stars, whose PSF is that of the result."""
+    own = fit.problem.sources[:, 0].copy()
+    if fit.coefficients.ndim == 3:
+        # The flux of a star is that of weights that sum to 1.
+        shapes = fit.problem.shapes(fit.coefficients)
+        own[:, :2] += mixture_arrays(shapes)[3]
+        own[:, 2] *= np.exp(shapes[..., 0]).sum(axis=1)
+    return own

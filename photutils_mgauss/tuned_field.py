@@ -1,0 +1,208 @@
+r"""
+A PSF from an archive, tuned to an image.
+
+When focus drifts, the PSF of an image is the archive's one with a few
+changes, which far fewer stars can tell than the whole PSF. At position
+:math:`(x, y)` Gaussian k of the archive's mixture becomes
+
+.. math::
+
+    \omega_k' \propto \omega_k e^{a z_k}, \quad
+    \boldsymbol\alpha_k' = \boldsymbol\alpha_k + \mathbf d\, z_k, \quad
+    \Sigma_k' = \Sigma_k + C,
+
+with :math:`z_k` the logarithm of its size about the mean one, and C, a and
+:math:`\mathbf d` polynomials of position.
+"""
+from dataclasses import dataclass, field
+
+import numpy as np
+from astropy.table import QTable
+
+from photutils_mgauss import _field_stages as stages
+from photutils_mgauss._field_forms import (
+    TunedShapes,
+    covariances_of,
+    shapes_of,
+)
+from photutils_mgauss._field_input import normalised
+from photutils_mgauss._field_result import Field, lattice
+from photutils_mgauss._validation import as_real, as_shape
+from photutils_mgauss.gridded import GriddedMixturePSF
+from photutils_mgauss.mixture import GaussianMixture
+
+__all__ = ['TunedMixtureField']
+
+# Of a unit pixel along either axis [pix^2].
+_PIXEL_VARIANCE = 1 / 12
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TunedMixtureField(Field):
+    """
+    A known PSF with changes that are polynomials of position.
+
+    Made by `fit_mixture_field` with ``start``. The flux centroid of the PSF
+    is where that of ``start`` is, so that positions keep the archive's
+    convention.
+
+    Parameters
+    ----------
+    start : GriddedMixturePSF
+        The known PSF.
+    coefficients : (T, 6) `~numpy.ndarray`
+        The T polynomial terms, as in `MixtureField`, of six changes: the
+        covariance xx, xy, yy of the Gaussian it is convolved with [pix^2],
+        and the change of log weight and of mean x and y [pix] for each
+        factor e in size. A negative covariance makes the PSF sharper.
+    shape, radius, stars, residual_stars, accuracy, dropped
+        As in `MixtureField`.
+    covariance : (6 T, 6 T) `~numpy.ndarray`
+        Of the coefficients, change by change and term by term within one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from photutils_mgauss import (GaussianMixture, GriddedMixturePSF,
+    ...                               fit_mixture_field)
+    >>> archive = GaussianMixture([0.8, 0.2], np.zeros((2, 2)),
+    ...                           [np.eye(2), 5 * np.eye(2)])
+    >>> now = archive.convolve([[0.3, 0], [0, 0.1]])
+    >>> stars = Table({'x': [12.3, 40.1], 'y': [14.6, 33.9]})
+    >>> data = sum(now.render((50, 55), x, y, flux=1000) for x, y in stars)
+    >>> tuned = fit_mixture_field(
+    ...     data, stars, error=np.ones((50, 55)), degree=0,
+    ...     start=GriddedMixturePSF([archive], [(27, 25)]))
+    >>> tuned.convolution_at(20, 20).round(2)
+    array([[0.3, 0. ],
+           [0. , 0.1]])
+    """
+
+    start: object
+    coefficients: np.ndarray
+    shape: tuple
+    radius: float
+    covariance: np.ndarray
+    stars: QTable
+    residual_stars: np.ndarray = field(default=None)
+    accuracy: float = 0.0
+    dropped: QTable = field(default=None)
+
+    def __repr__(self):
+        used = int(np.count_nonzero(self.stars['used']))
+        return (f'<TunedMixtureField(degree={self.degree}, '
+                f'shape={self.shape}, {used} of {len(self.stars)} stars)>')
+
+    @property
+    def degree(self):
+        """The degree of the polynomials."""
+        return int(np.sqrt(2 * len(self.coefficients))) - 1
+
+    def changes_at(self, x, y):
+        """
+        Return the six changes at a detector position.
+
+        Parameters
+        ----------
+        x, y : float
+            The position [pix].
+
+        Returns
+        -------
+        (6,) `~numpy.ndarray`
+            In the order of ``coefficients``.
+        """
+        return (self._basis(x, y) @ self.coefficients)[0]
+
+    def convolution_at(self, x, y):
+        """
+        Return the covariance of the Gaussian that the PSF is convolved with.
+
+        Parameters
+        ----------
+        x, y : float
+            The position [pix].
+
+        Returns
+        -------
+        (2, 2) `~numpy.ndarray`
+            [pix^2].
+        """
+        xx, xy, yy = self.changes_at(x, y)[:3]
+        return np.array([[xx, xy], [xy, yy]])
+
+    def _basis(self, x, y):
+        x, y = as_real(x, 'x'), as_real(y, 'y')
+        return stages.polynomials(*normalised([x], [y], self.shape),
+                                  self.degree)
+
+    def mixture_at(self, x, y):
+        """
+        Return the PSF at a detector position.
+
+        Parameters
+        ----------
+        x, y : float
+            The position [pix].
+
+        Returns
+        -------
+        GaussianMixture
+            Of as many Gaussians as ``start`` has there. It contains the
+            pixel.
+        """
+        shapes, sign = TunedShapes().shapes(
+            self.coefficients, self._basis(x, y),
+            known_shapes(self.start, [x], [y]))
+        return GaussianMixture(sign[0] * np.exp(shapes[0, :, 0]),
+                               shapes[0, :, 1:3], covariances_of(shapes[0]))
+
+    def to_grid(self, grid_shape=None):
+        """
+        Return the field sampled on a grid, as a model for photutils.
+
+        Parameters
+        ----------
+        grid_shape : int or (int, int), optional
+            The number of nodes along y and x, from the first pixel to the
+            last; by default the nodes of ``start``.
+
+        Returns
+        -------
+        GriddedMixturePSF
+        """
+        if grid_shape is not None or not hasattr(self.start, 'grid_xypos'):
+            grid_shape = as_shape(grid_shape or (30, 30), 'grid_shape')
+            places = np.column_stack(list(lattice(grid_shape, self.shape)))
+        else:
+            places = np.asarray(self.start.grid_xypos, float)
+        scale_at = getattr(self.start, 'scale_at', lambda x, y: 1.0)
+        return GriddedMixturePSF(
+            [self.mixture_at(*place) for place in places], places,
+            scales=[float(scale_at(*place)) for place in places])
+
+
+def known_shapes(start, x, y):
+    """
+    Return what `TunedShapes` needs of a PSF at n places, (n, K, 8).
+
+    Where there are fewer Gaussians than elsewhere, some have no weight.
+    """
+    pixel = (_PIXEL_VARIANCE * np.eye(2)
+             if getattr(start, 'pixel_integrated', False) else None)
+    found = []
+    for place in zip(x, y, strict=True):
+        mixture = start.mixture_at(*place)
+        found.append(shapes_of(mixture if pixel is None
+                               else mixture.convolve(pixel)))
+    most = max(len(sign) for _, sign in found)
+    shapes, signs = np.zeros((len(found), most, 6)), np.ones((len(found),
+                                                              most))
+    for i, (one, sign) in enumerate(found):
+        n = len(sign)
+        shapes[i], signs[i, :n] = one[np.argmax(one[:, 0])], sign
+        # Not exactly 0, which has no logarithm.
+        shapes[i, n:, 0] = -690
+        shapes[i, :n] = one
+    return TunedShapes.local(shapes, signs)

@@ -1,0 +1,135 @@
+"""One PSF field from several exposures."""
+import numpy as np
+import pytest
+from astropy.table import Table
+from numpy.testing import assert_allclose
+
+from photutils_mgauss import (
+    EmpiricalPSF,
+    GaussianMixture,
+    MixtureField,
+    fit_mixture_field,
+)
+
+SHAPE = (200, 220)
+# What the jitter of each exposure adds to all covariances.
+JITTER = np.array([[0.0, 0, 0], [0.3, 0.1, 0.1], [0.1, -0.1, 0.5]])
+
+
+def psf_at(x, y, exposure=None):
+    u = x / 110 - 1
+    psf = GaussianMixture.from_stddevs(
+        [0.8, 0.2], np.zeros((2, 2)), [[1.2 + 0.1 * u, 1.3], [2.8, 2.6]],
+        [0.05, 0])
+    xx, xy, yy = (JITTER.mean(axis=0) if exposure is None
+                  else JITTER[exposure])
+    return psf.convolve([[xx, xy], [xy, yy]])
+
+
+@pytest.fixture(scope='module')
+def exposures():
+    rng = np.random.default_rng(12)
+    images, tables, errors = [], [], []
+    for e in range(3):
+        stars = Table({'x': rng.uniform(5, 214, 25),
+                       'y': rng.uniform(5, 194, 25),
+                       'flux': rng.uniform(2e4, 6e4, 25)})
+        clean = sum(psf_at(x, y, e).render(SHAPE, x, y, flux=flux)
+                    for x, y, flux in stars.iterrows())
+        images.append(rng.poisson(clean + 30) - 30.0)
+        tables.append(stars)
+        errors.append(np.sqrt(clean + 30))
+    return images, tables, errors
+
+
+@pytest.fixture(scope='module')
+def field(exposures):
+    data, stars, error = exposures
+    return fit_mixture_field(data, stars, error=error, n_components=2,
+                             degree=1, radius=8)
+
+
+def test_what_each_exposure_adds_is_found(field):
+    table = field.exposures
+    found = np.column_stack([table[name] for name in ('xx', 'xy', 'yy')])
+    errors = np.column_stack([table[f'{name}_err'] for name in
+                              ('xx', 'xy', 'yy')])
+    pulls = (found - (JITTER - JITTER.mean(axis=0))) / errors
+    assert np.abs(pulls).max() < 4
+    assert np.all(errors < 0.03)
+
+
+@pytest.mark.parametrize('exposure', [None, 0, 1, 2])
+def test_the_psf_of_each_exposure_is_near_the_truth(field, exposure):
+    steps = np.arange(-6, 6.1, 0.5)
+    for x, y in [(30, 40), (180, 150)]:
+        truth = psf_at(x, y, exposure).evaluate(steps, steps[:, None])
+        mine = field.mixture_at(x, y, exposure=exposure).evaluate(
+            steps, steps[:, None])
+        assert np.abs(mine - truth).max() < 0.02 * truth.max()
+
+
+def test_stars_tell_their_exposure(field, exposures):
+    assert_allclose(np.bincount(field.stars['exposure']), 25)
+    for e, stars in enumerate(exposures[1]):
+        rows = field.stars['exposure'] == e
+        assert_allclose(field.stars['x_fit'][rows], stars['x'], atol=0.05)
+    assert 0.9 < np.median(field.stars['reduced_chi2']) < 1.1
+
+
+def test_a_grid_may_be_that_of_one_exposure(field):
+    grid = field.to_grid((2, 2), exposure=1)
+    assert_allclose(grid.mixture_at(0, 0).evaluate(1, 1),
+                    field.mixture_at(0, 0, exposure=1).evaluate(1, 1))
+
+
+def test_exposures_survive_a_file(field, tmp_path):
+    field.write(tmp_path / 'field.fits')
+    again = MixtureField.read(tmp_path / 'field.fits')
+    assert_allclose(again.mixture_at(5, 5, exposure=2).covariances,
+                    field.mixture_at(5, 5, exposure=2).covariances)
+
+
+def test_one_exposure_in_a_list_is_one_exposure(exposures):
+    data, stars, error = exposures
+    options = {'n_components': 1, 'degree': 0, 'radius': 6}
+    alone = fit_mixture_field(data[0], stars[0], error=error[0], **options)
+    listed = fit_mixture_field(data[:1], stars[:1], error=error[:1],
+                               **options)
+    assert_allclose(listed.coefficients, alone.coefficients)
+    assert listed.exposures is None
+
+
+def test_cross_validation_takes_exposures(exposures):
+    data, stars, error = exposures
+    field = fit_mixture_field(data, stars, error=error, n_components=2,
+                              degree='auto', radius=6)
+    assert field.degree in (1, 2)
+
+
+def test_an_empirical_psf_takes_exposures(exposures):
+    data, stars, error = exposures
+    empirical = EmpiricalPSF.from_stars(data, stars, error=error, degree=1,
+                                        n_components=2, radius=7)
+    image = empirical.image_at(110, 100)
+    steps = (np.arange(len(image)) - len(image) // 2) / 2
+    truth = psf_at(110, 100).evaluate(steps, steps[:, None])
+    assert np.abs(image - truth).max() < 0.03 * truth.max()
+
+
+@pytest.mark.parametrize(('change', 'text'), [
+    (lambda d, s, e: (d[:2], s, e), 'data must hold an image for each of'),
+    (lambda d, s, e: (d, s, e[:2]), 'error must hold an image for each of'),
+    (lambda d, s, e: ([d[0], d[1], d[2][:90]], s, [e[0], e[1], e[2][:90]]),
+     'data must be exposures of one detector'),
+    (lambda d, s, e: ([], [], None), 'stars must hold at least 1 table'),
+])
+def test_lists_that_do_not_fit_are_errors(exposures, change, text):
+    data, stars, error = change(*exposures)
+    with pytest.raises(ValueError, match=text):
+        fit_mixture_field(data, stars, error=error)
+
+
+def test_an_exposure_that_does_not_exist_is_an_error(field):
+    with pytest.raises(ValueError, match='exposure must be below 3, got 3'):
+        field.mixture_at(1, 1, exposure=3)
