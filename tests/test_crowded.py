@@ -359,7 +359,9 @@ def test_an_entry_where_nothing_is_keeps_its_row_and_says_so():
     table = photometry()(data, error=error, init_params=init)
     assert list(table['flags'] & NOT_SEEN > 0) == [True, False]
     assert abs(table['flux_fit'][0]) < 4 * table['flux_err'][0]
+    # Its place is known no worse than the list says.
     assert abs(table['x_fit'][0] - 45) < 1
+    assert 0.4 < table['x_err'][0] < 0.7
     assert abs(table['x_fit'][1] - 20.3) < 0.05
 
 
@@ -374,11 +376,29 @@ def test_two_entries_for_one_star_are_told():
     assert_allclose(phot.make_model_image((62, 62)).sum(), 2e4, rtol=0.03)
 
 
-def test_an_entry_between_two_stars_takes_the_brighter():
+def test_a_listed_star_stays_within_bounds_and_says_so():
+    data, error = expose(draw([20.3], [21.1], [2e4], (62, 62)), 3)
+    init = Table({'x': [19.9], 'y': [21.1]})
+    for find in (True, False):
+        phot = photometry(find_neighbors=find, xy_bounds=0.15)
+        table = phot(data, error=error, init_params=init)
+        assert_allclose(table['x_fit'], 20.05)
+        assert table['flags'][0] & 32
+
+
+def test_entries_outside_the_image_keep_their_rows():
+    data, error = expose(draw([20.3], [21.1], [2e4], (62, 62)), 3)
+    init = Table({'x': [-30.0, 20.3, np.nan], 'y': [5.0, 21.1, 3.0]})
+    table = photometry()(data, error=error, init_params=init)
+    assert list(np.isfinite(table['x_fit'])) == [False, True, False]
+    assert list(table['flags'] & 64 > 0) == [True, False, True]
+
+
+def test_an_entry_midway_between_two_stars_takes_the_brighter():
     data, error = expose(draw([20.0, 21.6], [21.1, 21.1], [5e4, 3e4],
                               (62, 62)), 3)
     table = photometry()(data, error=error,
-                         init_params=Table({'x': [20.6], 'y': [21.1]}))
+                         init_params=Table({'x': [20.82], 'y': [21.1]}))
     assert abs(table['x_fit'][0] - 20) < 0.05
     assert abs(table['flux_fit'][0] / 5e4 - 1) < 0.05
 
