@@ -145,6 +145,8 @@ class Tile:
         # Stars hide the sky.
         self.level = (self.mesh.faint_level(self.data, self.good) if size
                       else np.zeros(len(self.mesh.ties)))
+        self.limits = (self.mesh.limits(self.data, self.good, self.noise)
+                       if size else (-np.inf, np.inf))
 
     def _make_templates(self):
         ny, nx = self.data.shape
@@ -337,7 +339,8 @@ class Tile:
         s.flux = s.flux + step[:, 0]
         s.x = s.x + step[:, 1]
         s.y = s.y + step[:, 2]
-        self.level = self.level + level_step
+        # A PSF that is much too wide would have the sky run away.
+        self.level = np.clip(self.level + level_step, *self.limits)
 
     def step(self, damping=0.0, moving=slice(None)):
         """Take one Gauss-Newton step, of all stars or only some."""

@@ -460,6 +460,31 @@ def test_a_wrong_psf_is_reported(crowd, factor, word):
         phot(crowd[0][:70, :70], error=crowd[1][:70, :70])
 
 
+@pytest.mark.parametrize('factor', [0.3, 2.5])
+@pytest.mark.filterwarnings('ignore:the PSF is too')
+def test_a_wrong_psf_does_not_make_the_sky_run_away(crowd, factor):
+    wrong = GaussianMixture(MIXTURE.weights, MIXTURE.means,
+                            factor * MIXTURE.covariances)
+    phot = CrowdedMixturePhotometry(GriddedMixturePSF([wrong], [(0, 0)]))
+    data, error = crowd[0][:90, :90], crowd[1][:90, :90]
+    table = phot(data, error=error)
+    nothing = (((data - np.median(data)) / error)**2).mean()
+    assert table.meta['reduced_chi2'] < nothing
+    assert np.abs(table['local_bkg']).max() < 200
+
+
+def test_limits_of_the_sky_hold_a_sky_of_noise_and_stars(crowd):
+    data, error = crowd[:2]
+    mesh = Mesh(data.shape, (0, 0), 64)
+    good = np.ones(data.shape, bool)
+    good[:32, :32] = False
+    low, high = mesh.limits(data, good, 7.0)
+    assert (low < 15).all()
+    assert (high > 25).all()
+    assert not np.isfinite(low[0])
+    assert np.isfinite(low[1:]).all()
+
+
 def test_units_pass_through(crowd):
     data, error = crowd[0][:50, :50], crowd[1][:50, :50]
     plain = photometry()(data, error=error)
