@@ -59,14 +59,28 @@ class Mesh:
 
     def faint_level(self, data, good):
         """Return the faint percentile (n,) of each node's good pixels."""
-        out = np.full(self.shape, np.nan)
+        level = self._percentiles(data, good, 20)
+        known = np.isfinite(level)
+        return np.where(known, level, np.median(level[known]))
+
+    def limits(self, data, good, noise):
+        """Return two levels (n,) between which the sky has to be."""
+        # Where stars hide all of it nothing else tells.
+        low, middle = self._percentiles(data, good, [1, 50])
+        low, high = (2 * low - middle - 3 * noise,
+                     2 * middle - low + 3 * noise)
+        return (np.where(np.isfinite(low), low, -np.inf),
+                np.where(np.isfinite(high), high, np.inf))
+
+    def _percentiles(self, data, good, which):
+        """Return percentiles (..., n) of each node's good pixels, or NaN."""
+        out = np.full((*self.shape, *np.shape(which)), np.nan)
         for j, i in np.ndindex(self.shape):
             part = np.ix_(self._owner[0] == j, self._owner[1] == i)
             seen = data[part][good[part]]
             if seen.size:
-                out[j, i] = np.percentile(seen, 20)
-        known = np.isfinite(out)
-        return np.where(known, out, np.median(out[known])).ravel()
+                out[j, i] = np.percentile(seen, which)
+        return out.reshape(len(self.ties), *np.shape(which)).T
 
     def shares(self, x, y):
         """Return the four nodes around positions and their shares (n, 4)."""

@@ -14,10 +14,10 @@ class Stars:
 
     COLUMNS = ('x', 'y', 'flux', 'x_init', 'y_init', 'flux_init',
                'significance', 'round', 'number', 'seeded', 'rows', 'paces',
-               'count')
+               'count', 'bound', 'hold')
 
     def __init__(self, x, y, flux, *, significance=0, found_in=0, number=-1,
-                 seeded=False, n_rows=0):
+                 seeded=False, bound=np.inf, hold=0, n_rows=0):
         n = len(x)
         self.x, self.y, self.flux = (np.array(v, float) for v in (x, y, flux))
         self.x_init, self.y_init = self.x.copy(), self.y.copy()
@@ -26,6 +26,9 @@ class Stars:
         self.round = np.zeros(n, int) + found_in
         self.number = np.zeros(n, int) + number
         self.seeded = np.zeros(n, bool) | seeded
+        # How far from its first place a star may go [pix], and the inverse
+        # variance with which it is held there.
+        self.bound, self.hold = np.zeros(n) + bound, np.zeros(n) + hold
         # The Gaussians of each star's PSF, filled in when it is drawn.
         self.rows = np.empty((n, n_rows, 6))
         self.paces = np.empty((n, n_rows, 4))
@@ -33,6 +36,11 @@ class Stars:
 
     def __len__(self):
         return self.x.size
+
+    @property
+    def listed(self):
+        """Whether each star is one of a given list."""
+        return self.number >= 0
 
     def select(self, chosen):
         """Keep the chosen stars only."""

@@ -8,8 +8,10 @@ from photutils_mgauss import _kernels
 
 # Photutils' own bits.
 PARTIAL, OUTSIDE, NO_FLUX, NO_CONVERGENCE, NO_COVARIANCE = 1, 2, 4, 8, 16
+AT_BOUND = 32
 # Ours, out of the way of any that photutils may add.
 SATURATED, BLENDED, NOT_A_STAR = 1 << 16, 1 << 17, 1 << 18
+NOT_SEEN, REPEATED = 1 << 19, 1 << 20
 
 # A star that still moved this far in the last step has not converged [pix].
 _STILL = 0.02
@@ -81,12 +83,34 @@ def tabulate(tile, core):
         significance=np.where(s.significance > 0, s.significance, strength),
         crowding=crowding, neighbor_distance=p.distance,
         neighbor_correlation=correlation, iter_detected=s.round)
-    table = StarTable(columns)
+    table = _with_repeats(StarTable(columns), tile)
+    return table.select(_inside(table.columns, core))
+
+
+def _inside(columns, core):
+    """Tell which stars are reported by the tile of a core."""
     y_low, y_high, x_low, x_high = core
-    # A star belongs to the tile whose core its nearest pixel is in.
-    x, y = np.rint(columns['x_fit']), np.rint(columns['y_fit'])
+    # A star belongs to the tile whose core its nearest pixel is in, one of a
+    # list to that of the place it is given.
+    listed = columns['number'] >= 0
+    x, y = (np.rint(np.where(listed, columns[f'{c}_init'],
+                             columns[f'{c}_fit'])) for c in 'xy')
     inside = (x >= x_low) & (x < x_high) & (y >= y_low) & (y < y_high)
-    return table.select(inside)
+    return inside & listed if listed.any() else inside
+
+
+def _with_repeats(table, tile):
+    """Add a row for each entry that means the star of another."""
+    if not tile.repeats:
+        return table
+    number, host, x, y = np.array(tile.repeats).T
+    order = np.argsort(tile.stars.number)
+    row = np.searchsorted(tile.stars.number, host, sorter=order)
+    more = table.select(order[row])
+    more.columns.update(number=number.astype(int),
+                        x_init=x + tile.origin[1], y_init=y + tile.origin[0],
+                        flags=more.columns['flags'] | REPEATED)
+    return StarTable.joined([table, more])
 
 
 def _quality(tile):
@@ -113,12 +137,16 @@ def _flags(tile, quality, error, correlation):
     s = tile.stars
     ny, nx = tile.data.shape
     flags = np.zeros(len(s), int)
+    gone = np.maximum(np.abs(s.x - s.x_init), np.abs(s.y - s.y_init))
     for bit, where in (
             (PARTIAL, quality[:, 0] < tile.width**2),
             (OUTSIDE, (s.x < -0.5) | (s.y < -0.5) | (s.x > nx - 0.5)
              | (s.y > ny - 0.5)),
             (NO_FLUX, ~(s.flux > 0)),
             (NO_CONVERGENCE, tile.moved > _STILL),
+            (AT_BOUND, gone > s.bound - 1e-6),
+            (NOT_SEEN, s.listed & ~(s.flux > tile.options.keep
+                                    * error[:, 0])),
             (NO_COVARIANCE, ~np.isfinite(error).all(axis=1)),
             (SATURATED, (quality[:, 5] < 0.5)),
             (NOT_A_STAR, tile.too_dense(s.x, s.y)),

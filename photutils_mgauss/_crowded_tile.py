@@ -20,6 +20,7 @@ from scipy.ndimage import label, maximum_filter
 from scipy.spatial import cKDTree
 
 from photutils_mgauss import _kernels
+from photutils_mgauss._crowded_given import take_up, warm_up
 from photutils_mgauss._crowded_sky import Mesh
 from photutils_mgauss._crowded_stars import Neighbours, Stars
 from photutils_mgauss._local_psf import MAX_WING
@@ -91,6 +92,8 @@ class TileOptions:
     floor: float
     noise: float
     max_rounds: int
+    find_neighbors: bool = True
+    xy_bounds: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -124,6 +127,9 @@ class Tile:
         self.origin = job.origin
         self.stars = Stars([], [], [], n_rows=self.psf.n_rows)
         self.graves = np.empty((0, 2))
+        # Entries of the list (number, number of the star, x, y) that mean
+        # the star of another.
+        self.repeats = []
         self.weight = np.divide(1, self.variance, where=self.good,
                                 out=np.zeros(self.data.shape))
         self.noise = job.options.noise
@@ -139,6 +145,8 @@ class Tile:
         # Stars hide the sky.
         self.level = (self.mesh.faint_level(self.data, self.good) if size
                       else np.zeros(len(self.mesh.ties)))
+        self.limits = (self.mesh.limits(self.data, self.good, self.noise)
+                       if size else (-np.inf, np.inf))
 
     def _make_templates(self):
         ny, nx = self.data.shape
@@ -273,7 +281,15 @@ class Tile:
                                self.matrix, self.gradient, self.reach)
         _kernels.pair_blocks(p.indptr, p.neighbour, p.twin, s.flux, *place,
                              self.weight, self.blocks)
+        self._hold()
         self._form_background_equations()
+
+    def _hold(self):
+        """Add what is known of the places of some stars."""
+        s = self.stars
+        self.matrix[:, [1, 2], [1, 2]] += s.hold[:, None]
+        self.gradient[:, 1] += s.hold * (s.x_init - s.x)
+        self.gradient[:, 2] += s.hold * (s.y_init - s.y)
 
     def _form_background_equations(self):
         """Form the matrix of the nodes' levels, and the gradient."""
@@ -310,7 +326,10 @@ class Tile:
             matrix, self.gradient, p.indptr, p.neighbour, self.blocks,
             *self._own_node(), self.reach, self.mesh_matrix,
             self.mesh_gradient, _TOLERANCE, _CG_STEPS, step, level_step)
-        step[:, 1:] = np.clip(step[:, 1:], -_MAX_MOVE, _MAX_MOVE)
+        for k, gone in ((1, s.x - s.x_init), (2, s.y - s.y_init)):
+            move = np.clip(step[:, k], -_MAX_MOVE, _MAX_MOVE)
+            step[:, k] = np.where(np.isfinite(s.bound), np.clip(
+                move, -s.bound - gone, s.bound - gone), move)
         step[:, 0] = np.clip(step[:, 0], (_LEAST_CHANGE - 1) * s.flux,
                              (_MOST_CHANGE - 1) * s.flux)
         return step, level_step
@@ -320,11 +339,15 @@ class Tile:
         s.flux = s.flux + step[:, 0]
         s.x = s.x + step[:, 1]
         s.y = s.y + step[:, 2]
-        self.level = self.level + level_step
+        # A PSF that is much too wide would have the sky run away.
+        self.level = np.clip(self.level + level_step, *self.limits)
 
-    def step(self, damping=0.0):
-        """Take one Gauss-Newton step."""
-        self._take(*self._solve(damping))
+    def step(self, damping=0.0, moving=slice(None)):
+        """Take one Gauss-Newton step, of all stars or only some."""
+        step, level_step = self._solve(damping)
+        taken = np.zeros_like(step)
+        taken[moving] = step[moving]
+        self._take(taken, level_step)
         self.refresh()
 
     def polish(self, damping):
@@ -447,14 +470,15 @@ class Tile:
         covariance, _ = self.covariances()
         with np.errstate(invalid='ignore'):
             strength = s.flux / np.sqrt(covariance[:, 0, 0])
-        weak = ~(strength >= threshold)
+        weak = ~(strength >= threshold) & ~s.listed
         near = np.hypot(s.x[p.owner] - s.x[p.neighbour],
                         s.y[p.owner] - s.y[p.neighbour]) < 2
         rival = (near & weak[p.neighbour]
                  & (s.flux[p.neighbour] < s.flux[p.owner]))
         weak[p.owner[rival]] = False
         ny, nx = self.data.shape
-        weak |= (s.x < -1) | (s.y < -1) | (s.x > nx) | (s.y > ny)
+        weak |= ~s.listed & ((s.x < -1) | (s.y < -1) | (s.x > nx)
+                             | (s.y > ny))
         gone = np.flatnonzero(weak)
         places = np.column_stack([s.x[gone], s.y[gone]])
         self.dismiss(weak)
@@ -517,31 +541,16 @@ def solve_tile(job):
         far each star went in the last step.
     """
     tile = Tile(job)
-    if job.given is not None:
-        x, y, flux, number = job.given
-        tile.stars = Stars(x, y, flux, number=number.astype(int),
-                           n_rows=tile.psf.n_rows)
-        _warm_up(tile)
+    if job.given is not None and not job.options.find_neighbors:
+        warm_up(tile, job.given)
     else:
         tile.seed_saturated()
         tile.refresh()
         _find_all(tile)
+        if job.given is not None:
+            take_up(tile, job.given)
     _settle(tile)
     return tile
-
-
-def _warm_up(tile):
-    """Bring given stars, perhaps without fluxes, near their solution."""
-    s = tile.stars
-    ny, nx = tile.data.shape
-    unknown = ~(s.flux > 0)
-    x = np.clip(np.rint(s.x), 0, nx - 1).astype(int)
-    y = np.clip(np.rint(s.y), 0, ny - 1).astype(int)
-    peak = np.maximum(tile.data[y, x] - tile.level.min(), tile.noise)
-    s.flux = np.where(unknown, peak / tile.profile[0], s.flux)
-    tile.refresh()
-    for damping in (1.0, 0.3, 0.1, 0.03):
-        tile.step(damping)
 
 
 # What is done does not depend on how many stars there are or move: what

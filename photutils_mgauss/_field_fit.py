@@ -14,7 +14,6 @@ whole problem is
 
 whose size does not depend on the number of stars.
 """
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -23,6 +22,7 @@ import numpy as np
 
 from photutils_mgauss import _kernels
 from photutils_mgauss._field_forms import rows_of
+from photutils_mgauss._parallel import available_cores
 
 # Standard deviations of the prior on log weight, x, y (of the PSF's width),
 # log_p, s, log_q: of a polynomial's constant, and of its other terms. A good
@@ -115,15 +115,16 @@ class Equations:
 class Workers:
     """Split stars over the threads or processes of an executor."""
 
+    # The same on every machine, so that sums over parts round alike.
+    N_PARTS = 16
+
     def __init__(self, executor=None):
-        self.n = len(os.sched_getaffinity(0)) if hasattr(
-            os, 'sched_getaffinity') else os.cpu_count()
         self._own = executor is None
         self.executor = executor
 
     def __enter__(self):
         if self._own:
-            self.executor = ThreadPoolExecutor(self.n)
+            self.executor = ThreadPoolExecutor(available_cores())
         return self
 
     def __exit__(self, *args):
@@ -132,7 +133,8 @@ class Workers:
 
     def map(self, function, n_stars, *args):
         """Call function(*args of a part of the stars) for each part."""
-        edges = np.linspace(0, n_stars, min(self.n, n_stars) + 1).astype(int)
+        edges = np.linspace(0, n_stars,
+                            min(self.N_PARTS, n_stars) + 1).astype(int)
         parts = [slice(a, b) for a, b in pairwise(edges)]
         jobs = [self.executor.submit(function, *(a[part] for a in args))
                 for part in parts]

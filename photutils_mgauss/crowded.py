@@ -17,7 +17,12 @@ from astropy.utils.exceptions import AstropyUserWarning
 from photutils_mgauss import _injection as injection
 from photutils_mgauss import _kernels
 from photutils_mgauss._crowded_image import Image, find_gain
-from photutils_mgauss._crowded_table import StarTable, as_qtable, tabulate
+from photutils_mgauss._crowded_table import (
+    REPEATED,
+    StarTable,
+    as_qtable,
+    tabulate,
+)
 from photutils_mgauss._crowded_tile import (
     CELL,
     TileJob,
@@ -139,6 +144,13 @@ class CrowdedMixturePhotometry:
         Where tiles are solved; by default a pool of threads on all cores.
     progress_bar : bool, optional
         Whether to show a bar with the stars found and their chi2.
+    find_neighbors : bool, optional
+        Whether stars that are missing from a given list are found and fitted
+        together with those on it. They are not reported. Otherwise the list
+        has to be complete.
+    xy_bounds : float or None, optional
+        How far, along each axis, a star of a given list may be from its
+        place [pix].
 
     Attributes
     ----------
@@ -159,7 +171,9 @@ class CrowdedMixturePhotometry:
     neighbour's flux; ``iter_detected``. Bits of ``flags`` beside photutils'
     own: 65536, most of the star is masked, as of saturated ones; 131072, a
     blend, the correlation is beyond 0.5; 262144, not a star: part of
-    something extended.
+    something extended. Of a given list, also: 524288, no significant star is
+    here, its flux has fewer than ``keep`` standard errors; 1048576, a repeat:
+    another entry means the same star, whose row this one shows again.
 
     Examples
     --------
@@ -183,7 +197,7 @@ class CrowdedMixturePhotometry:
     def __init__(self, psf_model, *, threshold=4.5, keep=2.5,
                  background_size=64, psf_error=0.01, effective_gain=None,
                  maxiters=3, tile_shape=1024, overlap=48, executor=None,
-                 progress_bar=False):
+                 progress_bar=False, find_neighbors=True, xy_bounds=1.0):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
         self.keep = as_real(keep, 'keep', minimum=0)
@@ -201,6 +215,10 @@ class CrowdedMixturePhotometry:
         self.overlap = as_integer(overlap, 'overlap', minimum=8)
         self.executor = executor
         self.progress_bar = bool(progress_bar)
+        self.find_neighbors = bool(find_neighbors)
+        self.xy_bounds = xy_bounds
+        if xy_bounds is not None:
+            self.xy_bounds = as_real(xy_bounds, 'xy_bounds', above=0)
         self.results = None
         self._psf = _local_psf(psf_model)
 
@@ -220,9 +238,9 @@ class CrowdedMixturePhotometry:
             The standard deviation of each pixel. By default it is estimated,
             one number for the image.
         init_params : `~astropy.table.Table`, optional
-            Positions ``x_init``, ``y_init`` and, if known, ``flux_init`` to
-            fit instead of finding stars. None is added, none left out, and
-            the result has their order.
+            Positions ``x_init``, ``y_init`` and, if known, ``flux_init`` of
+            the stars to report. None is added, none left out, and the result
+            has their order.
 
         Returns
         -------
@@ -274,7 +292,8 @@ class CrowdedMixturePhotometry:
             gain=None if gain in (None, np.inf) else float(gain),
             floor=float(variance.min()),
             noise=float(np.sqrt(np.median(variance))),
-            max_rounds=self.maxiters)
+            max_rounds=self.maxiters, find_neighbors=self.find_neighbors,
+            xy_bounds=np.inf if self.xy_bounds is None else self.xy_bounds)
 
     def _run(self, jobs):
         """Return the outcome of each job, None where it failed."""
@@ -350,6 +369,7 @@ class CrowdedMixturePhotometry:
         table = self.results
         flux = np.asarray(getattr(table['flux_fit'], 'value',
                                   table['flux_fit']), float)
+        flux = np.where(table['flags'] & REPEATED, 0, flux)
         image = _draw(self._psf, table['x_fit'], table['y_fit'], flux, shape,
                       psf_shape)
         if include_local_bkg and len(table):

@@ -20,6 +20,8 @@ _NEIGHBOUR_SHARE = 0.01
 # many robust standard deviations and this share, are no single stars.
 _SHAPE_LIMIT = 5.0
 _SHAPE_SHARE = 0.15
+# Between two sources that are found [pix].
+_MIN_SEPARATION = 1.5
 
 
 def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
@@ -122,10 +124,12 @@ def _detect(data, mask, fwhm, threshold, finder):
         if threshold is None:
             threshold = 5 * mad_std(data[~mask])
         threshold = as_real(threshold, 'threshold', above=0)
+        # Below 1 photutils 3.1 makes a source of every pixel of a star.
+        separation = max(0.5 * fwhm, _MIN_SEPARATION)
         # Sharp and flat sources are judged later, with a reason.
         finder = DAOStarFinder(threshold, fwhm, scale_threshold=False,
-                               min_separation=0.5 * fwhm, sharpness_range=None,
-                               roundness_range=None)
+                               min_separation=separation,
+                               sharpness_range=None, roundness_range=None)
     with warnings.catch_warnings():
         warnings.simplefilter('ignore', NoDetectionsWarning)
         found = finder(data, mask=mask)

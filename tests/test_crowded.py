@@ -21,6 +21,7 @@ from photutils_mgauss import (
 )
 from photutils_mgauss._crowded_sky import Mesh
 from photutils_mgauss._crowded_stars import Neighbours, Stars
+from photutils_mgauss._crowded_table import NOT_SEEN, REPEATED
 from photutils_mgauss._crowded_tile import Tile, TileJob, TileOptions
 from photutils_mgauss._local_psf import LocalPSF
 
@@ -296,6 +297,112 @@ def test_given_positions_are_fitted_in_their_order(crowd):
     assert np.median(gap) < 0.05
 
 
+def offset(table, x, y):
+    return np.hypot(table['x_fit'] - x, table['y_fit'] - y)
+
+
+@pytest.fixture(scope='module')
+def half_listed(crowd):
+    """Return half of the visible stars, and their rows fitted as a list."""
+    data, error, x, y, flux = crowd
+    inside = (x > 2) & (y > 2) & (x < 137) & (y < 117)
+    rows = np.flatnonzero((flux > 1500) & inside)[::2]
+    init = Table({'x': x[rows] + 0.1, 'y': y[rows] - 0.1})
+    return rows, init, photometry()(data, error=error, init_params=init)
+
+
+def test_half_a_list_is_fitted_as_well_as_all_of_it(crowd, half_listed):
+    data, error, x, y, _ = crowd
+    rows, _, table = half_listed
+    whole = photometry(find_neighbors=False)(
+        data, error=error, init_params=Table({'x': x, 'y': y}))
+    gap, best = offset(table, x[rows], y[rows]), offset(whole, x, y)[rows]
+    assert np.median(gap) < 1.1 * np.median(best)
+    assert (gap > 0.5).mean() < (best > 0.5).mean() + 0.03
+
+
+def test_stars_that_are_not_listed_are_fitted_but_not_reported(
+        crowd, half_listed):
+    data, error, x, y, _ = crowd
+    rows, init, table = half_listed
+    assert len(table) == len(init)
+    assert_allclose(table['x_init'], init['x'])
+    assert (np.abs(table['x_fit'] - init['x']) < 1 + 1e-9).all()
+    alone = photometry(find_neighbors=False)(data, error=error,
+                                             init_params=init)
+    gap, far = (offset(t, x[rows], y[rows]) for t in (table, alone))
+    assert np.median(gap) < 0.7 * np.median(far)
+
+
+def test_a_list_of_what_is_found_changes_nothing(crowd, fitted):
+    init = Table({'x': fitted['x_fit'], 'y': fitted['y_fit']})
+    table = photometry()(crowd[0], error=crowd[1], init_params=init)
+    moved = offset(table, init['x'], init['y'])
+    error = np.hypot(fitted['x_err'], fitted['y_err'])
+    assert not (table['flags'] & REPEATED).any()
+    assert np.percentile(moved / error, 99) < 0.1
+
+
+def test_tiles_do_not_change_a_listed_star(crowd, half_listed):
+    _, init, whole = half_listed
+    table = photometry(tile_shape=(70, 80))(crowd[0], error=crowd[1],
+                                            init_params=init)
+    moved = offset(table, whole['x_fit'], whole['y_fit'])
+    assert (moved < 1e-3).mean() > 0.97
+    assert (np.abs(table['flags'] & REPEATED)
+            == whole['flags'] & REPEATED).mean() > 0.99
+
+
+def test_an_entry_where_nothing_is_keeps_its_row_and_says_so():
+    data, error = expose(draw([20.3], [21.1], [2e4], (62, 62)), 3)
+    init = Table({'x': [45.0, 20.3], 'y': [40.0, 21.1]})
+    table = photometry()(data, error=error, init_params=init)
+    assert list(table['flags'] & NOT_SEEN > 0) == [True, False]
+    assert abs(table['flux_fit'][0]) < 4 * table['flux_err'][0]
+    # Its place is known no worse than the list says.
+    assert abs(table['x_fit'][0] - 45) < 1
+    assert 0.4 < table['x_err'][0] < 0.7
+    assert abs(table['x_fit'][1] - 20.3) < 0.05
+
+
+def test_two_entries_for_one_star_are_told():
+    data, error = expose(draw([20.3], [21.1], [2e4], (62, 62)), 3)
+    init = Table({'x': [20.5, 20.3], 'y': [21.0, 21.1]})
+    phot = photometry()
+    table = phot(data, error=error, init_params=init)
+    assert list(table['flags'] & REPEATED > 0) == [True, False]
+    assert_allclose(table['flux_fit'], table['flux_fit'][1])
+    assert_allclose(table['x_init'], init['x'])
+    assert_allclose(phot.make_model_image((62, 62)).sum(), 2e4, rtol=0.03)
+
+
+def test_a_listed_star_stays_within_bounds_and_says_so():
+    data, error = expose(draw([20.3], [21.1], [2e4], (62, 62)), 3)
+    init = Table({'x': [19.9], 'y': [21.1]})
+    for find in (True, False):
+        phot = photometry(find_neighbors=find, xy_bounds=0.15)
+        table = phot(data, error=error, init_params=init)
+        assert_allclose(table['x_fit'], 20.05)
+        assert table['flags'][0] & 32
+
+
+def test_entries_outside_the_image_keep_their_rows():
+    data, error = expose(draw([20.3], [21.1], [2e4], (62, 62)), 3)
+    init = Table({'x': [-30.0, 20.3, np.nan], 'y': [5.0, 21.1, 3.0]})
+    table = photometry()(data, error=error, init_params=init)
+    assert list(np.isfinite(table['x_fit'])) == [False, True, False]
+    assert list(table['flags'] & 64 > 0) == [True, False, True]
+
+
+def test_an_entry_midway_between_two_stars_takes_the_brighter():
+    data, error = expose(draw([20.0, 21.6], [21.1, 21.1], [5e4, 3e4],
+                              (62, 62)), 3)
+    table = photometry()(data, error=error,
+                         init_params=Table({'x': [20.82], 'y': [21.1]}))
+    assert abs(table['x_fit'][0] - 20) < 0.05
+    assert abs(table['flux_fit'][0] / 5e4 - 1) < 0.05
+
+
 def test_noise_alone_holds_no_stars():
     rng = np.random.default_rng(2)
     table = photometry()(rng.normal(50, 7, (150, 150)),
@@ -353,6 +460,31 @@ def test_a_wrong_psf_is_reported(crowd, factor, word):
         phot(crowd[0][:70, :70], error=crowd[1][:70, :70])
 
 
+@pytest.mark.parametrize('factor', [0.3, 2.5])
+@pytest.mark.filterwarnings('ignore:the PSF is too')
+def test_a_wrong_psf_does_not_make_the_sky_run_away(crowd, factor):
+    wrong = GaussianMixture(MIXTURE.weights, MIXTURE.means,
+                            factor * MIXTURE.covariances)
+    phot = CrowdedMixturePhotometry(GriddedMixturePSF([wrong], [(0, 0)]))
+    data, error = crowd[0][:90, :90], crowd[1][:90, :90]
+    table = phot(data, error=error)
+    nothing = (((data - np.median(data)) / error)**2).mean()
+    assert table.meta['reduced_chi2'] < nothing
+    assert np.abs(table['local_bkg']).max() < 200
+
+
+def test_limits_of_the_sky_hold_a_sky_of_noise_and_stars(crowd):
+    data = crowd[0]
+    mesh = Mesh(data.shape, (0, 0), 64)
+    good = np.ones(data.shape, bool)
+    good[:32, :32] = False
+    low, high = mesh.limits(data, good, 7.0)
+    assert (low < 15).all()
+    assert (high > 25).all()
+    assert not np.isfinite(low[0])
+    assert np.isfinite(low[1:]).all()
+
+
 def test_units_pass_through(crowd):
     data, error = crowd[0][:50, :50], crowd[1][:50, :50]
     plain = photometry()(data, error=error)
@@ -398,7 +530,8 @@ def test_the_progress_bar_tells_of_stars_and_chi2(crowd, capsys):
 @pytest.mark.parametrize(('keyword', 'value', 'error'), [
     ('threshold', -1, ValueError), ('keep', 'x', TypeError),
     ('background_size', 2, ValueError), ('tile_shape', 5, ValueError),
-    ('overlap', 2, ValueError), ('maxiters', 0, ValueError)])
+    ('overlap', 2, ValueError), ('maxiters', 0, ValueError),
+    ('xy_bounds', 0, ValueError)])
 def test_bad_keywords_are_named(keyword, value, error):
     with pytest.raises(error, match=keyword):
         photometry(**{keyword: value})

@@ -18,7 +18,8 @@ SLOW = ('pymc', 'pytensor', 'arviz', 'matplotlib.pyplot')
 SKY_PACKAGES = ('gwcs', 'astropy.coordinates', 'astropy.time', 'astropy.wcs')
 
 with TABLE.open(newline='') as file:
-    ROWS = {row['Module']: row for row in csv.DictReader(file)}
+    LINES = list(csv.DictReader(file))
+ROWS = {row['Module']: row for row in LINES}
 LAYERS = {name: int(row['Layer']) for name, row in ROWS.items()}
 KNOWN = [name for name in MODULES if name in LAYERS]
 
@@ -83,6 +84,9 @@ def run(code):
 def test_every_module_has_a_layer():
     unknown = [name for name in MODULES if name not in LAYERS]
     assert not unknown, f'add {unknown} to the table in docs/layers.csv'
+    assert len(LINES) == len(ROWS), 'docs/layers.csv has a module twice'
+    gone = [name for name in ROWS if name not in MODULES]
+    assert not gone, f'take {gone} out of the table in docs/layers.csv'
 
 
 @pytest.mark.parametrize('name', KNOWN)

@@ -30,6 +30,12 @@ def test_good_stars_are_selected(data):
     assert table['selected'].sum() == len(GOOD)
 
 
+@pytest.mark.parametrize('fwhm', [1.5, 1.8, 3.3])
+def test_a_star_is_found_once_whatever_the_width_looked_for(data, fwhm):
+    table = select_psf_stars(data, fwhm=fwhm, threshold=20)
+    assert len(table) == table['selected'].sum() == len(GOOD)
+
+
 def test_a_star_at_the_edge_is_rejected(data):
     data += PSF.render(SHAPE, 5, 80, flux=5000)
     assert reason_at(select_psf_stars(data), 5, 80) == 'edge'

@@ -11,8 +11,8 @@ exposure, never the true one, and is that of all programs but SExtractor
 Parts: ``peers`` prints completeness, false stars, RMS/CRLB, flux bias and
 pulls of each program, and median position errors beside ours on each one's
 list and on the stars of both; ``given`` the same with all programs that can
-on SExtractor's list (crowdsource moves no stars of a given list); ``curve``
-completeness over false stars at 24-25 mag;
+on SExtractor's list of its windowed positions (crowdsource moves no stars of
+a given list); ``curve`` completeness over false stars at 24-25 mag;
 ``area`` CPU seconds and memory of growing images, the scene repeated where
 it is smaller. SExtractor, PSFEx and IRAF run if they are installed,
 crowdsource with ``--crowdsource PYTHON``, an interpreter that has it and the
@@ -125,9 +125,9 @@ class Bench:
                 self.folder / 'crowdsource', self.sky)
         return self._crowdsource
 
-    def start(self, scene):
-        """Return SExtractor's list with windowed positions, in a scene."""
-        table = self.sextractor()['SExtractor WIN'][0]
+    def start(self, scene, name='SExtractor WIN'):
+        """Return SExtractor's list with some of its positions, in a scene."""
+        table = self.sextractor()[name][0]
         n = scene.size - 1
         return table[(table['x'] > 0) & (table['y'] > 0) & (table['x'] < n)
                      & (table['y'] < n)]
@@ -170,7 +170,8 @@ def given_part(bench):
                                  init_params=init)
     print_score(f'ours ({scene.size}^2, {seconds:.1f} CPU s)',
                 Score.of(scene, table))
-    lists = {'SExtractor WIN': (start, np.nan),
+    lists = {**{name: (bench.start(scene, name), np.nan)
+                for name in bench.sextractor()},
              'PSFPhotometry': peers.timed(peers.photutils_list, scene,
                                           bench.psf, bench.sky, start)}
     if peers.IRAF:
