@@ -14,7 +14,7 @@ contributes those of its own PSF.
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
 
-from photutils_mgauss import _compat
+from photutils_mgauss import _compat, _kernels
 from photutils_mgauss._psf_model import PSFModel
 
 __all__ = ['MixtureFitter']
@@ -27,11 +27,6 @@ _MESSAGES = {
 
 # Of the expected next step, see _State.length.
 _TOLERANCE = 1e-6
-
-# What fraction of the fall of chi2 that the normal equations promise a step
-# should bring: below the first damping grows, above the second it falls.
-POOR_GAIN = 0.25
-FAIR_GAIN = 0.75
 
 # The least factor by which steps are taken to get shorter.
 _LEAST_RATE = 0.03
@@ -323,7 +318,8 @@ def _minimize(problem, max_steps):
         state = new
         if _remainder(length, last) < _TOLERANCE:
             return state, 3, n + 2
-        last, damping = length, next_damping(damping, gain)
+        last, damping = length, _kernels._next_damping(
+            damping, gain)
     status = 2 if fall < _LEAST_FALL * state.chi2 else 0
     return state, status, max_steps + 1
 
@@ -334,21 +330,7 @@ def _gain(state, new, step):
     if expected > 1e-9 * state.chi2:
         return (state.chi2 - new.chi2) / expected
     # Of a smaller fall nothing is left after rounding: keep the damping.
-    return POOR_GAIN
-
-
-def next_damping(damping, gain):
-    """
-    Return the damping after a step that brought gain of what it promised.
-
-    A faint star needs some even at its minimum, where the curvature that the
-    normal matrix leaves out makes undamped steps overshoot.
-    """
-    if gain < POOR_GAIN:
-        return max(4 * damping, 1e-2)
-    if gain < FAIR_GAIN:
-        return damping
-    return damping / 10 if damping > 1e-4 else 0.0
+    return _kernels._POOR_GAIN
 
 
 def _remainder(length, last):

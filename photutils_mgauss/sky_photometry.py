@@ -19,7 +19,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import QTable
 
-from photutils_mgauss import _kernels, fitter
+from photutils_mgauss import _kernels
 from photutils_mgauss._star_fits import (
     Image,
     cut_boxes,
@@ -411,12 +411,12 @@ def _gain(state, trial, step):
     # Of a smaller fall nothing is left after rounding: keep the damping.
     known = expected > 1e-9 * state.chi2
     return np.divide(state.chi2 - trial.chi2, expected, where=known,
-                     out=np.full(len(step), fitter.POOR_GAIN))
+                     out=np.full(len(step), _kernels._POOR_GAIN))
 
 
 def _next_damping(damping, gain):
-    """Do what fitter.next_damping does, for many stars."""
-    return np.array([fitter.next_damping(*pair)
+    """Do what the kernel of one fit does, for many stars."""
+    return np.array([_kernels._next_damping(*pair)
                      for pair in zip(damping, gain, strict=True)])
 
 
