@@ -7,6 +7,7 @@ takes the star it means, and entries that mean none get one of their own.
 import numpy as np
 from scipy.spatial import cKDTree
 
+from photutils_mgauss._crowded_search import leave_out
 from photutils_mgauss._crowded_stars import Stars
 
 # A star further from its entry has to be this much brighter to be meant: a
@@ -50,7 +51,7 @@ def take_up(tile, given):
     left = _tell_repeats(tile, places, number, left, same)
     _add(tile, places[left], number[left])
     tile.step(0.05, _beside_added(tile))
-    tile.leave_out(tile.options.keep)
+    leave_out(tile, tile.options.keep)
     tile.step(0.05, _beside_added(tile))
 
 

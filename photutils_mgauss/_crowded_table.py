@@ -5,6 +5,7 @@ import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss import _kernels
+from photutils_mgauss._crowded_search import too_dense
 
 # Photutils' own bits.
 PARTIAL, OUTSIDE, NO_FLUX, NO_CONVERGENCE, NO_COVARIANCE = 1, 2, 4, 8, 16
@@ -44,6 +45,12 @@ class StarTable:
         """Return the chosen stars, in that order."""
         return StarTable({name: column[chosen]
                           for name, column in self.columns.items()})
+
+    def sort(self, *keys):
+        """Order the stars, column by column to save memory."""
+        order = np.lexsort([self.columns[key] for key in keys[::-1]])
+        for name in self.columns:
+            self.columns[name] = self.columns[name][order]
 
 
 COLUMNS = (
@@ -149,22 +156,24 @@ def _flags(tile, quality, error, correlation):
                                     * error[:, 0])),
             (NO_COVARIANCE, ~np.isfinite(error).all(axis=1)),
             (SATURATED, (quality[:, 5] < 0.5)),
-            (NOT_A_STAR, tile.too_dense(s.x, s.y)),
+            (NOT_A_STAR, too_dense(tile, s.x, s.y)),
             (BLENDED, np.abs(correlation) > _BLEND_CORRELATION)):
         flags[where] |= bit
     return flags
 
 
 def as_qtable(table, unit, meta):
-    """Return the stars as photutils' table."""
-    columns = dict(table.columns)
-    n = len(table)
-    columns.pop('number')
+    """Return the stars as photutils' table; empties the one given."""
+    columns = table.columns
+    n = columns.pop('number').size
     out = QTable(meta=meta)
     out['id'] = np.arange(1, n + 1)
     out['group_id'] = np.arange(1, n + 1)
     out['group_size'] = np.ones(n, int)
-    for name, column in columns.items():
-        flux = name in ('local_bkg', 'flux_init', 'flux_fit', 'flux_err')
-        out[name] = column * unit if flux and unit is not None else column
+    for name in list(columns):
+        column = columns.pop(name)
+        if name in ('local_bkg', 'flux_init', 'flux_fit', 'flux_err') and (
+                unit is not None):
+            column = column * unit
+        out.add_column(column, name=name, copy=False)
     return out

@@ -16,11 +16,8 @@ Positions here are tile pixels.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import label, maximum_filter
-from scipy.spatial import cKDTree
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._crowded_given import take_up, warm_up
 from photutils_mgauss._crowded_sky import Mesh
 from photutils_mgauss._crowded_stars import Neighbours, Stars
 from photutils_mgauss._local_psf import MAX_WING
@@ -48,36 +45,15 @@ _CG_STEPS = 400
 # tile begins where a cell does.
 CELL = 32
 _TEMPLATE_HALF = 3
-# Pixels where nine together stand out less than this fraction of the
-# threshold are not looked at.
-_HINT = 0.4
-# A further star is looked for within this distance of a known one [pix], with
-# the known one free to move; where less than this fraction of the
-# information is left, the two cannot be told apart.
-_REACH = 2.3
-_LEAST = 0.05
-# No star is added this close to another, or to one that was taken away [pix].
-_SEPARATION = 0.3
-_GRAVE = 0.5
-# Finding starts with the brightest stars.
-_FALLING = (80, 25, 10)
-_FINAL_STEPS = 6
 # Polishing moves no star further than this [pix]: blends that cannot be
 # resolved would run away.
 _ROAM = 0.5
 # A step smaller than this, in pixels and in standard errors, is not taken.
-_REST = 2e-5
+REST = 2e-5
 # Pixels further than this from the model take no part in the background.
 _BACKGROUND_CLIP = 4.0
-# Within this distance [pix], stars are too many to be stars if each has less
-# than this many times the PSF's own area, in which half a star's information
-# lies.
-_DENSITY_REACH = 6.0
-_OWN_AREA = 0.7
 # What is known of each star's stamp.
 _FRAME = ('wing', 'width', 'left', 'bottom', 'offset')
-# Groups of bad pixels of up to this many may hide a saturated star.
-_SATURATED_PIXELS = (2, 2000)
 
 
 @dataclass(frozen=True)
@@ -113,6 +89,12 @@ class TileJob:
     origin: tuple
     core: tuple
     given: np.ndarray | None = None
+
+    @property
+    def is_empty(self):
+        """Whether there is nothing to fit."""
+        return not (self.variance > 0).any() or (
+            self.given is not None and self.given.size == 0)
 
 
 class Tile:
@@ -360,9 +342,9 @@ class Tile:
         step, level_step = self._solve(damping)
         moved = np.abs(step[:, 1:]).max(axis=1, initial=0)
         self._rein(step)
-        restless = moved > _REST
+        restless = moved > REST
         restless |= (np.abs(step[:, 0]) * np.sqrt(self.matrix[:, 0, 0])
-                     > _REST)
+                     > REST)
         step[~restless] = 0
         self.redraw(np.flatnonzero(restless),
                     lambda: self._take(step, level_step))
@@ -405,254 +387,9 @@ class Tile:
                                    correlation)
         return covariance, correlation
 
-    # Finding and leaving out.
-
-    def find(self, threshold, found_in):
-        """Add the maxima of significance on the residual."""
-        significance, flux = self._scores(threshold)
-        peak = (significance > threshold) & (
-            significance == maximum_filter(significance, 3))
-        y, x = np.nonzero(peak)
-        dx, dy = _vertex(significance, x, y)
-        found = Stars(x + dx, y + dy, flux[y, x],
-                      significance=significance[y, x], found_in=found_in,
-                      n_rows=self.psf.n_rows)
-        found.select(self._apart(found))
-        self.admit(found)
-
-    def _scores(self, threshold):
-        ny, nx = self.data.shape
-        significance = np.zeros((ny, nx))
-        flux = np.zeros((ny, nx))
-        light = self.options.psf_error * np.maximum(self.star_light(), 0)
-        weight = np.divide(self.weight, 1 + self.weight * light**2)
-        for j, i in np.ndindex(self.templates.shape[:2]):
-            _kernels.score(
-                self.residual, weight, self.templates[j, i], i * CELL,
-                min((i + 1) * CELL, nx), j * CELL, min((j + 1) * CELL, ny),
-                _HINT * threshold, significance, flux)
-        s, p = self.stars, self.pairs
-        _kernels.score_beside(
-            s.x, s.y, s.flux, *self._place(), self.jets, self.matrix,
-            self.gradient, p.indptr, p.neighbour, self.blocks, self.templates,
-            CELL, self.weight, self.residual, light, _REACH, _LEAST,
-            threshold, significance, flux)
-        return significance, flux
-
-    def _apart(self, found):
-        apart = np.ones(len(found), bool)
-        positions = np.column_stack([found.x, found.y])
-        stars = np.column_stack([self.stars.x, self.stars.y])
-        for places, limit in ((stars, _SEPARATION), (self.graves, _GRAVE)):
-            if len(places) and len(found):
-                apart &= cKDTree(places).query(positions)[0] > limit
-        return apart & ~self.too_dense(found.x, found.y)
-
-    def too_dense(self, x, y):
-        """Tell at which positions there are more stars than can be."""
-        s = self.stars
-        if not len(s) or not len(x):
-            return np.zeros(len(x), bool)
-        tree = cKDTree(np.column_stack([s.x, s.y]))
-        count = tree.query_ball_point(np.column_stack([x, y]),
-                                      _DENSITY_REACH, return_length=True)
-        # The part of the circle that is on the tile.
-        ny, nx = self.data.shape
-        part = [np.minimum(v + 0.5, _DENSITY_REACH)
-                + np.minimum(n - 0.5 - v, _DENSITY_REACH)
-                for v, n in ((x, nx), (y, ny))]
-        space = np.pi / 4 * np.prod(np.maximum(part, 1), axis=0)
-        return (count * self.area * _OWN_AREA > space) & (count > 5)
-
-    def leave_out(self, threshold):
-        """Remove the weakest of each clump of insignificant stars."""
-        s, p = self.stars, self.pairs
-        covariance, _ = self.covariances()
-        with np.errstate(invalid='ignore'):
-            strength = s.flux / np.sqrt(covariance[:, 0, 0])
-        weak = ~(strength >= threshold) & ~s.listed
-        near = np.hypot(s.x[p.owner] - s.x[p.neighbour],
-                        s.y[p.owner] - s.y[p.neighbour]) < 2
-        rival = (near & weak[p.neighbour]
-                 & (s.flux[p.neighbour] < s.flux[p.owner]))
-        weak[p.owner[rival]] = False
-        ny, nx = self.data.shape
-        weak |= ~s.listed & ((s.x < -1) | (s.y < -1) | (s.x > nx)
-                             | (s.y > ny))
-        gone = np.flatnonzero(weak)
-        places = np.column_stack([s.x[gone], s.y[gone]])
-        self.dismiss(weak)
-        return places
-
-    def seed_saturated(self):
-        """Put a star on each clump of bad pixels that has a star's wings."""
-        clumps, n = label(~self.good)
-        if n == 0:
-            return
-        size = np.bincount(clumps.ravel())[1:]
-        low, high = _SATURATED_PIXELS
-        found = [self._wing_star(clumps, k + 1)
-                 for k in np.flatnonzero((size >= low) & (size <= high))]
-        found = [star for star in found if star is not None]
-        if found:
-            x, y, flux, significance = np.array(found).T
-            self.stars.append(Stars(x, y, flux, significance=significance,
-                                    seeded=True, n_rows=self.psf.n_rows))
-
-    def _wing_star(self, clumps, k):
-        y, x = np.nonzero(clumps == k)
-        column, row = round(x.mean()), round(y.mean())
-        half = int(max(np.ptp(x), np.ptp(y)) / 2) + 6
-        ny, nx = self.data.shape
-        part = (slice(max(0, row - half), min(ny, row + half + 1)),
-                slice(max(0, column - half), min(nx, column + half + 1)))
-        stamp = self.psf.stamp(column, row, half)[
-            part[0].start - row + half:part[0].stop - row + half,
-            part[1].start - column + half:part[1].stop - column + half]
-        w = self.weight[part]
-        info = (w * stamp**2).sum()
-        if info == 0:
-            return None
-        # The faintest wing pixels say how bright the star can be: others may
-        # hold neighbours.
-        seen = (w > 0) & (stamp > 0.002 * stamp.max())
-        if seen.sum() < 8:
-            return None
-        ratio = (self.data[part] - self.background()[part])[seen] / stamp[seen]
-        flux = np.median(ratio)
-        significance = flux * np.sqrt(info)
-        if significance < 10 * self.options.threshold:
-            return None
-        return x.mean(), y.mean(), flux, significance
-
-
-def solve_tile(job):
-    """
-    Find and fit the stars of a tile.
-
-    Parameters
-    ----------
-    job : TileJob
-
-    Returns
-    -------
-    Tile
-        Solved, its equations those of the solution, with ``moved`` (n,), how
-        far each star went in the last step.
-    """
-    tile = Tile(job)
-    if job.given is not None and not job.options.find_neighbors:
-        warm_up(tile, job.given)
-    else:
-        tile.seed_saturated()
-        tile.refresh()
-        _find_all(tile)
-        if job.given is not None:
-            take_up(tile, job.given)
-    _settle(tile)
-    return tile
-
-
-# What is done does not depend on how many stars there are or move: what
-# happens around a star has to be the same on every tile it is on.
-
-def _find_all(tile):
-    options = tile.options
-    for number, threshold in enumerate(_FALLING):
-        if threshold > options.threshold:
-            tile.find(threshold, number)
-            tile.step(0.05)
-            if number == 0:
-                # Later, errors of the PSF are hidden by false companions.
-                tile.step(0.05)
-                tile.widths = _size_differences(tile)
-            tile.leave_out(1.0)
-    for number in range(options.max_rounds):
-        tile.find(options.threshold, len(_FALLING) + number)
-        tile.step(0.05)
-        if number < 2:
-            tile.leave_out(0.7 * options.keep)
-        else:
-            tile.step(0.05)
-            gone = tile.leave_out(options.keep)
-            tile.graves = np.concatenate([tile.graves, gone])
-
-
-def _settle(tile):
-    tile.stars.count[:] = 0
-    tile.start_polishing()
-    tile.moved = np.zeros(len(tile.stars))
-    for _ in range(_FINAL_STEPS):
-        tile.moved = tile.polish(0.02)
-        if not (tile.moved > _REST).any():
-            break
-    # Some may have moved out of the middle of their stamps.
-    tile.refresh()
-
 
 def _offsets(width, start):
     """Return where stamps of these widths begin, and where they end."""
     ends = start + np.cumsum(width**2)
     return (np.concatenate([[start], ends])[:-1].astype(np.int64),
             int(ends[-1]) if len(ends) else start)
-
-
-def _vertex(image, x, y):
-    """Return the offsets of the tops of parabolas through three pixels."""
-    ny, nx = image.shape
-    out = []
-    for step_x, step_y in ((1, 0), (0, 1)):
-        here = image[y, x]
-        after = image[np.minimum(y + step_y, ny - 1),
-                      np.minimum(x + step_x, nx - 1)]
-        before = image[np.maximum(y - step_y, 0), np.maximum(x - step_x, 0)]
-        bend = 2 * here - before - after
-        shift = np.divide(0.5 * (after - before), bend, where=bend > 0,
-                          out=np.zeros(x.size))
-        out.append(np.clip(shift, -0.5, 0.5))
-    return out
-
-
-def _size_differences(tile):
-    """
-    Return by how much the PSF's variance is too small at bright stars.
-
-    The Laplacian of a PSF is its derivative by the variance of a Gaussian it
-    is convolved with; its amplitude in the residual is fitted, with star and
-    Laplacian together: a star that is too wide is too bright, too.
-    """
-    s, out = tile.stars, []
-    bright = np.flatnonzero(
-        (s.flux * tile.profile[0] > 50 * tile.noise) & ~s.seeded)
-    ny, nx = tile.data.shape
-    for i in bright[np.argsort(-s.flux[bright])][:200]:
-        w, y, x = tile.width[i], tile.bottom[i], tile.left[i]
-        if x < 0 or y < 0 or x + w > nx or y + w > ny:
-            continue
-        window = slice(y, y + w), slice(x, x + w)
-        stamp = tile.jets[0, tile.offset[i]:tile.offset[i] + w * w]
-        out.append(_size_difference(stamp.reshape(w, w), s.flux[i],
-                                    tile.weight[window],
-                                    tile.residual[window]))
-    return np.array([value for value in out if np.isfinite(value)])
-
-
-def _size_difference(stamp, flux, weight, residual):
-    # A bright star's PSF error is in proportion to its light, whatever the
-    # photon noise: all pixels of the stamp count alike.
-    good = (weight > 0).astype(float)
-    slope = sum(np.gradient(np.gradient(stamp, axis=a), axis=a)
-                for a in (0, 1)) / 2
-    data = residual / flux
-    a = (good * slope * slope).sum()
-    b = (good * slope * stamp).sum()
-    c = (good * stamp * stamp).sum()
-    det = a * c - b * b
-    if not det > 0:
-        return np.nan
-    change = (c * (good * slope * data).sum()
-              - b * (good * stamp * data).sum()) / det
-    j, k = np.indices(stamp.shape) - len(stamp) // 2
-    core = (j**2 + k**2) <= 9
-    size = (stamp * core * (j**2 + k**2)).sum() / (2 * (stamp * core).sum())
-    return change / size

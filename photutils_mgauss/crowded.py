@@ -6,8 +6,6 @@ stars are subtracted, as Sec. 5 of Nie et al. asks of a method for the
 Galactic bulge.
 """
 import warnings
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
 
 import numpy as np
 from astropy.nddata import NDData
@@ -17,21 +15,15 @@ from astropy.utils.exceptions import AstropyUserWarning
 from photutils_mgauss import _injection as injection
 from photutils_mgauss import _kernels
 from photutils_mgauss._crowded_image import Image, find_gain
+from photutils_mgauss._crowded_plan import Plan, run
 from photutils_mgauss._crowded_table import (
     REPEATED,
     StarTable,
     as_qtable,
-    tabulate,
 )
-from photutils_mgauss._crowded_tile import (
-    CELL,
-    TileJob,
-    TileOptions,
-    solve_tile,
-)
+from photutils_mgauss._crowded_tile import TileOptions
 from photutils_mgauss._injection import InjectionResult
 from photutils_mgauss._local_psf import LocalPSF
-from photutils_mgauss._parallel import available_cores
 from photutils_mgauss._validation import (
     as_floats,
     as_integer,
@@ -135,9 +127,10 @@ class CrowdedMixturePhotometry:
     maxiters : int, optional
         The largest number of searches at the final threshold.
     tile_shape : int or (ny, nx) tuple of int, optional
-        The image is solved in tiles of this many pixels. Smaller ones need
-        less memory, spread over more workers, and cost more: each sees 96 to
-        128 pixels beyond its borders if the background is fitted.
+        The image is solved in even tiles of at most this many pixels.
+        Smaller ones need less memory, spread over more workers, and cost
+        more: each sees 96 to 128 pixels beyond its borders if the background
+        is fitted.
     overlap : int, optional
         How far a tile sees beyond its borders [pix].
     executor : `~concurrent.futures.Executor`, optional
@@ -196,7 +189,7 @@ class CrowdedMixturePhotometry:
 
     def __init__(self, psf_model, *, threshold=4.5, keep=2.5,
                  background_size=64, psf_error=0.01, effective_gain=None,
-                 maxiters=3, tile_shape=1024, overlap=48, executor=None,
+                 maxiters=3, tile_shape=1536, overlap=48, executor=None,
                  progress_bar=False, find_neighbors=True, xy_bounds=1.0):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
@@ -255,37 +248,25 @@ class CrowdedMixturePhotometry:
             If a worker failed; the finished tiles are in the error.
         """
         image = Image.of(data, error, mask)
-        self._image = image
         given = None if init_params is None else _given(init_params)
-        options = self._options(image)
-        jobs = [_job(image, self._psf, options, core, self.overlap, given)
-                for core in _cores(image.data.shape, self.tile_shape)]
-        jobs = [job for job in jobs if (job.variance > 0).any()
-                and (given is None or job.given.size)]
-        outcomes = self._run(jobs)
-        done = [outcome for outcome in outcomes if outcome is not None]
-        stars = StarTable.joined([outcome.stars for outcome in done])
-        meta = self._report(done, stars)
-        if given is not None:
-            stars = _in_given_order(stars, given)
-        else:
-            stars = stars.select(np.lexsort((stars.columns['x_fit'],
-                                             stars.columns['y_fit'])))
-        self.results = as_qtable(stars, image.unit, meta)
-        if len(done) < len(jobs):
-            unfinished = [_clipped(job.core, image.data.shape)
-                          for job, outcome in zip(jobs, outcomes, strict=True)
-                          if outcome is None]
-            raise UnfinishedTilesError(unfinished, self.results) from next(
-                e for e in self._errors)
+        plan = Plan(image, self._psf, self._options(image), self.tile_shape,
+                    self.overlap, given)
+        outcomes, errors = run(plan, self.executor, self.progress_bar)
+        unfinished = [core for core, outcome in zip(plan.cores, outcomes,
+                                                    strict=True)
+                      if outcome is None]
+        self.results = self._table(outcomes, given, image.unit)
+        if unfinished:
+            raise UnfinishedTilesError(unfinished, self.results) from errors[0]
         return self.results
 
     def _options(self, image):
+        data, variance = image.sample()
         gain = self.effective_gain
         if gain is None:
-            gain = find_gain(image)
-        good = image.variance > 0
-        variance = image.variance[good] if good.any() else np.ones(1)
+            gain = find_gain(data, variance)
+        if variance.size == 0:
+            variance = np.ones(1)
         return TileOptions(
             threshold=self.threshold, keep=self.keep,
             background_size=self.background_size, psf_error=self.psf_error,
@@ -295,33 +276,18 @@ class CrowdedMixturePhotometry:
             max_rounds=self.maxiters, find_neighbors=self.find_neighbors,
             xy_bounds=np.inf if self.xy_bounds is None else self.xy_bounds)
 
-    def _run(self, jobs):
-        """Return the outcome of each job, None where it failed."""
-        self._errors = []
-        if self.executor is not None:
-            return self._collect(self.executor, jobs)
-        with ThreadPoolExecutor(available_cores()) as pool:
-            return self._collect(pool, jobs)
-
-    def _collect(self, pool, jobs):
-        outcomes = [None] * len(jobs)
-        futures = {}
-        for number, job in enumerate(jobs):
-            try:
-                futures[pool.submit(_work, job)] = number
-            except RuntimeError as error:  # the pool has broken
-                self._errors.append(error)
-        bar = _bar(len(jobs)) if self.progress_bar else None
-        for future in as_completed(futures):
-            try:
-                outcomes[futures[future]] = future.result()
-            except Exception as error:  # noqa: BLE001 a worker may die of any
-                self._errors.append(error)
-            if bar is not None:
-                _advance(bar, outcomes)
-        if bar is not None:
-            bar.close()
-        return outcomes
+    def _table(self, outcomes, given, unit):
+        """Put the stars of the tiles together; empties the list."""
+        done = [outcome for outcome in outcomes if outcome is not None]
+        outcomes.clear()
+        stars = StarTable.joined([outcome.stars for outcome in done])
+        meta = self._report(done, stars)
+        del done
+        if given is not None:
+            stars = _in_given_order(stars, given)
+        else:
+            stars.sort('y_fit', 'x_fit')
+        return as_qtable(stars, unit, meta)
 
     def _report(self, done, stars):
         widths = np.concatenate([o.widths for o in done]) if done else []
@@ -334,7 +300,7 @@ class CrowdedMixturePhotometry:
             word = 'narrow' if width > 0 else 'wide'
             warnings.warn(f'the PSF is too {word}: the variance of the light '
                           f'of bright stars differs by {width:+.0%}',
-                          AstropyUserWarning, stacklevel=3)
+                          AstropyUserWarning, stacklevel=4)
         return {'n_stars': len(stars), 'reduced_chi2': chi2,
                 'psf_size_difference': width}
 
@@ -400,23 +366,6 @@ class CrowdedMixturePhotometry:
             include_local_bkg=include_local_bkg)
 
 
-@dataclass(frozen=True)
-class _Outcome:
-    """What comes back from a worker."""
-
-    stars: StarTable
-    chi2: float
-    n_pixels: int
-    widths: np.ndarray
-
-
-def _work(job):
-    tile = solve_tile(job)
-    chi = tile.weight * tile.residual**2
-    return _Outcome(tabulate(tile, job.core), float(chi.sum()),
-                    int(tile.good.sum()), tile.widths)
-
-
 def _local_psf(model):
     grid = getattr(model, '_grid', None)
     if grid is not None:
@@ -432,58 +381,6 @@ def _local_psf(model):
         np.zeros(1), np.zeros(1), mixture.weights[None],
         mixture.means[None], mixture.covariances[None],
         bool(model.pixel_integrated))
-
-
-def _cores(shape, tile_shape):
-    """Return (y_low, y_high, x_low, x_high) of each tile."""
-    ny, nx = shape
-    ty, tx = tile_shape
-    return [(y, min(y + ty, ny), x, min(x + tx, nx))
-            for y in range(0, ny, ty) for x in range(0, nx, tx)]
-
-
-def _job(image, psf, options, core, overlap, given):
-    ny, nx = image.data.shape
-    margin = options.background_size or 0
-    y_low, y_high = _window(core[:2], ny, overlap, margin)
-    x_low, x_high = _window(core[2:], nx, overlap, margin)
-    window = slice(y_low, y_high), slice(x_low, x_high)
-    # The outermost tiles also own the stars just outside the image.
-    core = (core[0] or -overlap,
-            core[1] if core[1] < ny else ny + overlap,
-            core[2] or -overlap,
-            core[3] if core[3] < nx else nx + overlap)
-    part = None
-    if given is not None:
-        x, y, flux, number = given
-        near = ((x > x_low - 1) & (x < x_high) & (y > y_low - 1)
-                & (y < y_high))
-        part = np.array([x[near] - x_low, y[near] - y_low, flux[near],
-                         number[near]])
-    return TileJob(np.ascontiguousarray(image.data[window]),
-                   np.ascontiguousarray(image.variance[window]),
-                   psf.moved(x_low, y_low), options, (y_low, x_low), core,
-                   part)
-
-
-def _window(core, size, overlap, spacing):
-    """
-    Return which pixels a tile sees along an axis.
-
-    It sees all of those that the background in its core rests on, nodes up
-    to one beyond it, and whole cells of the PSF.
-    """
-    low, high = core[0] - overlap, core[1] + overlap
-    if spacing:
-        low = min(low, (core[0] // spacing - 1.5) * spacing)
-        high = max(high, (-(-core[1] // spacing) + 1.5) * spacing)
-    return (max(0, int(low // CELL) * CELL),
-            min(size, -int(-high // CELL) * CELL))
-
-
-def _clipped(core, shape):
-    y, x = np.clip(core[:2], 0, shape[0]), np.clip(core[2:], 0, shape[1])
-    return tuple(int(v) for v in (*y, *x))
 
 
 def _given(table):
@@ -552,19 +449,6 @@ def _nearest_background(table, shape):
     return level[good][nearest].reshape(shape)
 
 
-def _bar(n):
-    from tqdm import tqdm
-    return tqdm(total=n, desc='tiles')
-
-
-def _advance(bar, outcomes):
-    done = [outcome for outcome in outcomes if outcome is not None]
-    chi2 = sum(o.chi2 for o in done) / max(sum(o.n_pixels for o in done), 1)
-    bar.set_postfix(stars=sum(len(o.stars) for o in done),
-                    chi2=f'{chi2:.2f}')
-    bar.update()
-
-
 def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
                        separation=20, radius=0.7, flux_ratio=2.5,
                        flux_edges=None, effective_gain=1.0, repeats=1,
@@ -629,7 +513,7 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     1.0
     """
     rng = np.random.default_rng(rng)
-    image = Image.of(data, error, mask)
+    image, variance = Image.of(data, error, mask).part()
     gain = as_real(effective_gain, 'effective_gain', above=0)
     repeats = as_integer(repeats, 'repeats', minimum=1)
     separation = as_real(separation, 'separation', minimum=5)
@@ -637,13 +521,11 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     known = _positions(before)
     tables = []
     for _ in range(repeats):
-        true = _artificial(image, flux, separation, rng)
-        light = _draw(photometry._psf, *true, image.data.shape, None)
+        true = _artificial(variance, flux, separation, rng)
+        light = _draw(photometry._psf, *true, image.shape, None)
         noisy = rng.poisson(np.maximum(light, 0) * gain) / gain
-        variance = image.variance + light / gain
-        table = photometry(
-            image.data + noisy, mask=image.variance == 0,
-            error=np.sqrt(np.where(image.variance > 0, variance, 1)))
+        table = photometry(image + noisy, mask=variance == 0,
+                           error=np.sqrt(variance + light / gain))
         row = injection.match(true, _positions(table), known, radius,
                               flux_ratio)
         tables.append(_injected(true, table, row))
@@ -654,16 +536,16 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     return InjectionResult(stars, injection.curves(stars, flux_edges))
 
 
-def _artificial(image, flux, separation, rng):
+def _artificial(variance, flux, separation, rng):
     """Draw x, y and flux of the artificial stars of one repeat."""
     limits = isinstance(flux, tuple)
     flux = np.atleast_1d(as_floats(flux, 'flux'))
     if not (flux > 0).all():
         msg = f'flux must be positive, got {flux.min()}'
         raise ValueError(msg)
-    n = image.data.size if limits else flux.size
-    x, y = injection.place_stars(image.data.shape, image.variance == 0, n,
-                                 separation, rng)
+    n = variance.size if limits else flux.size
+    x, y = injection.place_stars(variance.shape, variance == 0, n, separation,
+                                 rng)
     if limits:
         flux = np.exp(rng.uniform(*np.log(flux), x.size))
     elif x.size < flux.size:

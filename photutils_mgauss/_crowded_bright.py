@@ -1,0 +1,96 @@
+"""Bright stars of a tile: saturated ones, and the size of the PSF."""
+import numpy as np
+from scipy.ndimage import label
+
+from photutils_mgauss._crowded_stars import Stars
+
+# Groups of bad pixels of up to this many may hide a saturated star.
+_SATURATED_PIXELS = (2, 2000)
+
+
+def seed_saturated(tile):
+    """Put a star on each clump of bad pixels that has a star's wings."""
+    clumps, n = label(~tile.good)
+    if n == 0:
+        return
+    size = np.bincount(clumps.ravel())[1:]
+    low, high = _SATURATED_PIXELS
+    found = [_wing_star(tile, clumps, k + 1)
+             for k in np.flatnonzero((size >= low) & (size <= high))]
+    found = [star for star in found if star is not None]
+    if found:
+        x, y, flux, significance = np.array(found).T
+        tile.stars.append(Stars(x, y, flux, significance=significance,
+                                seeded=True, n_rows=tile.psf.n_rows))
+
+
+def _wing_star(tile, clumps, k):
+    y, x = np.nonzero(clumps == k)
+    column, row = round(x.mean()), round(y.mean())
+    half = int(max(np.ptp(x), np.ptp(y)) / 2) + 6
+    ny, nx = tile.data.shape
+    part = (slice(max(0, row - half), min(ny, row + half + 1)),
+            slice(max(0, column - half), min(nx, column + half + 1)))
+    stamp = tile.psf.stamp(column, row, half)[
+        part[0].start - row + half:part[0].stop - row + half,
+        part[1].start - column + half:part[1].stop - column + half]
+    w = tile.weight[part]
+    info = (w * stamp**2).sum()
+    if info == 0:
+        return None
+    # The faintest wing pixels say how bright the star can be: others may
+    # hold neighbours.
+    seen = (w > 0) & (stamp > 0.002 * stamp.max())
+    if seen.sum() < 8:
+        return None
+    ratio = (tile.data[part] - tile.background()[part])[seen] / stamp[seen]
+    flux = np.median(ratio)
+    significance = flux * np.sqrt(info)
+    if significance < 10 * tile.options.threshold:
+        return None
+    return x.mean(), y.mean(), flux, significance
+
+
+def size_differences(tile):
+    """
+    Return by how much the PSF's variance is too small at bright stars.
+
+    The Laplacian of a PSF is its derivative by the variance of a Gaussian it
+    is convolved with; its amplitude in the residual is fitted, with star and
+    Laplacian together: a star that is too wide is too bright, too.
+    """
+    s, out = tile.stars, []
+    bright = np.flatnonzero(
+        (s.flux * tile.profile[0] > 50 * tile.noise) & ~s.seeded)
+    ny, nx = tile.data.shape
+    for i in bright[np.argsort(-s.flux[bright])][:200]:
+        w, y, x = tile.width[i], tile.bottom[i], tile.left[i]
+        if x < 0 or y < 0 or x + w > nx or y + w > ny:
+            continue
+        window = slice(y, y + w), slice(x, x + w)
+        stamp = tile.jets[0, tile.offset[i]:tile.offset[i] + w * w]
+        out.append(_size_difference(stamp.reshape(w, w), s.flux[i],
+                                    tile.weight[window],
+                                    tile.residual[window]))
+    return np.array([value for value in out if np.isfinite(value)])
+
+
+def _size_difference(stamp, flux, weight, residual):
+    # A bright star's PSF error is in proportion to its light, whatever the
+    # photon noise: all pixels of the stamp count alike.
+    good = (weight > 0).astype(float)
+    slope = sum(np.gradient(np.gradient(stamp, axis=a), axis=a)
+                for a in (0, 1)) / 2
+    data = residual / flux
+    a = (good * slope * slope).sum()
+    b = (good * slope * stamp).sum()
+    c = (good * stamp * stamp).sum()
+    det = a * c - b * b
+    if not det > 0:
+        return np.nan
+    change = (c * (good * slope * data).sum()
+              - b * (good * stamp * data).sum()) / det
+    j, k = np.indices(stamp.shape) - len(stamp) // 2
+    core = (j**2 + k**2) <= 9
+    size = (stamp * core * (j**2 + k**2)).sum() / (2 * (stamp * core).sum())
+    return change / size

@@ -1,0 +1,160 @@
+"""A crowded image cut into tiles, and these solved by workers."""
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from photutils_mgauss._crowded_image import Image
+from photutils_mgauss._crowded_solve import solve_tile
+from photutils_mgauss._crowded_table import StarTable, tabulate
+from photutils_mgauss._crowded_tile import CELL, TileJob, TileOptions
+from photutils_mgauss._local_psf import LocalPSF
+from photutils_mgauss._parallel import available_cores
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What comes back from a worker."""
+
+    stars: StarTable
+    chi2: float = 0.0
+    n_pixels: int = 0
+    widths: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+    @classmethod
+    def of(cls, job):
+        """Solve a tile."""
+        if job.is_empty:
+            return cls(StarTable.empty())
+        tile = solve_tile(job)
+        chi = tile.weight * tile.residual**2
+        return cls(tabulate(tile, job.core), float(chi.sum()),
+                   int(tile.good.sum()), tile.widths)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """
+    How an image is cut into tiles.
+
+    ``given`` is None, or x, y, flux and number of the stars of a list.
+    """
+
+    image: Image
+    psf: LocalPSF
+    options: TileOptions
+    tile_shape: tuple
+    overlap: int
+    given: tuple | None
+
+    @property
+    def cores(self):
+        """The pixels (y_low, y_high, x_low, x_high) of each tile."""
+        rows, columns = (_even_parts(n, tile) for n, tile in zip(
+            self.image.shape, self.tile_shape, strict=True))
+        return [(*row, *column) for row in rows for column in columns]
+
+    def job(self, core):
+        """Cut out a tile."""
+        ny, nx = self.image.shape
+        margin = self.options.background_size or 0
+        y_low, y_high = _window(core[:2], ny, self.overlap, margin)
+        x_low, x_high = _window(core[2:], nx, self.overlap, margin)
+        part = None
+        if self.given is not None:
+            x, y, flux, number = self.given
+            near = ((x > x_low - 1) & (x < x_high) & (y > y_low - 1)
+                    & (y < y_high))
+            part = np.array([x[near] - x_low, y[near] - y_low, flux[near],
+                             number[near]])
+        return TileJob(*self.image.part(np.s_[y_low:y_high, x_low:x_high]),
+                       self.psf.moved(x_low, y_low), self.options,
+                       (y_low, x_low), self._reported(core), part)
+
+    def _reported(self, core):
+        """Return where the stars are that the tile of a core reports."""
+        # The outermost tiles also own the stars just outside the image.
+        ny, nx = self.image.shape
+        return (core[0] or -self.overlap,
+                core[1] if core[1] < ny else ny + self.overlap,
+                core[2] or -self.overlap,
+                core[3] if core[3] < nx else nx + self.overlap)
+
+    def work(self, core):
+        """Cut out a tile and solve it."""
+        return Outcome.of(self.job(core))
+
+
+def _even_parts(size, largest):
+    """Return (low, high) of as few even parts as the largest part allows."""
+    part = -(-size // -(-size // largest))
+    # Tiles see fewer pixels if they begin where cells do.
+    part = min(-(-part // CELL) * CELL, largest)
+    return [(low, min(low + part, size)) for low in range(0, size, part)]
+
+
+def _window(core, size, overlap, spacing):
+    """
+    Return which pixels a tile sees along an axis.
+
+    It sees all of those that the background in its core rests on, nodes up
+    to one beyond it, and whole cells of the PSF.
+    """
+    low, high = core[0] - overlap, core[1] + overlap
+    if spacing:
+        low = min(low, (core[0] // spacing - 1.5) * spacing)
+        high = max(high, (-(-core[1] // spacing) + 1.5) * spacing)
+    return (max(0, int(low // CELL) * CELL),
+            min(size, -int(-high // CELL) * CELL))
+
+
+def run(plan, executor, progress_bar):
+    """
+    Solve all tiles of a plan.
+
+    Returns
+    -------
+    outcomes : list of Outcome or None
+        One for each core of the plan, None where a worker failed.
+    errors : list of Exception
+    """
+    if executor is not None:
+        # Others may be elsewhere: they get no more than their tile.
+        return _collect(executor, Outcome.of, map(plan.job, plan.cores),
+                        progress_bar)
+    with ThreadPoolExecutor(available_cores()) as pool:
+        return _collect(pool, plan.work, plan.cores, progress_bar)
+
+
+def _collect(pool, work, tasks, progress_bar):
+    outcomes, errors, futures = [], [], {}
+    for task in tasks:
+        try:
+            futures[pool.submit(work, task)] = len(outcomes)
+        except RuntimeError as error:  # the pool has broken
+            errors.append(error)
+        outcomes.append(None)
+    bar = _bar(len(outcomes)) if progress_bar else None
+    for future in as_completed(futures):
+        try:
+            outcomes[futures[future]] = future.result()
+        except Exception as error:  # noqa: BLE001 a worker may die of any
+            errors.append(error)
+        if bar is not None:
+            _advance(bar, outcomes)
+    if bar is not None:
+        bar.close()
+    return outcomes, errors
+
+
+def _bar(n):
+    from tqdm import tqdm
+    return tqdm(total=n, desc='tiles')
+
+
+def _advance(bar, outcomes):
+    done = [outcome for outcome in outcomes if outcome is not None]
+    chi2 = sum(o.chi2 for o in done) / max(sum(o.n_pixels for o in done), 1)
+    bar.set_postfix(stars=sum(len(o.stars) for o in done),
+                    chi2=f'{chi2:.2f}')
+    bar.update()

@@ -1,0 +1,123 @@
+"""Finding stars on the residual of a tile, and leaving some out again."""
+import numpy as np
+from scipy.ndimage import maximum_filter
+from scipy.spatial import cKDTree
+
+from photutils_mgauss import _kernels
+from photutils_mgauss._crowded_stars import Stars
+from photutils_mgauss._crowded_tile import CELL
+
+# Pixels where nine together stand out less than this fraction of the
+# threshold are not looked at.
+_HINT = 0.4
+# A further star is looked for within this distance of a known one [pix], with
+# the known one free to move; where less than this fraction of the
+# information is left, the two cannot be told apart.
+_REACH = 2.3
+_LEAST = 0.05
+# No star is added this close to another, or to one that was taken away [pix].
+_SEPARATION = 0.3
+_GRAVE = 0.5
+# Within this distance [pix], stars are too many to be stars if each has less
+# than this many times the PSF's own area, in which half a star's information
+# lies.
+_DENSITY_REACH = 6.0
+_OWN_AREA = 0.7
+
+
+def find(tile, threshold, found_in):
+    """Add the maxima of significance on the residual."""
+    significance, flux = _scores(tile, threshold)
+    peak = (significance > threshold) & (
+        significance == maximum_filter(significance, 3))
+    y, x = np.nonzero(peak)
+    dx, dy = _vertex(significance, x, y)
+    found = Stars(x + dx, y + dy, flux[y, x],
+                  significance=significance[y, x], found_in=found_in,
+                  n_rows=tile.psf.n_rows)
+    found.select(_apart(tile, found))
+    tile.admit(found)
+
+
+def _scores(tile, threshold):
+    ny, nx = tile.data.shape
+    significance = np.zeros((ny, nx))
+    flux = np.zeros((ny, nx))
+    light = tile.options.psf_error * np.maximum(tile.star_light(), 0)
+    weight = np.divide(tile.weight, 1 + tile.weight * light**2)
+    for j, i in np.ndindex(tile.templates.shape[:2]):
+        _kernels.score(
+            tile.residual, weight, tile.templates[j, i], i * CELL,
+            min((i + 1) * CELL, nx), j * CELL, min((j + 1) * CELL, ny),
+            _HINT * threshold, significance, flux)
+    s, p = tile.stars, tile.pairs
+    _kernels.score_beside(
+        s.x, s.y, s.flux, *tile._place(), tile.jets, tile.matrix,
+        tile.gradient, p.indptr, p.neighbour, tile.blocks, tile.templates,
+        CELL, tile.weight, tile.residual, light, _REACH, _LEAST,
+        threshold, significance, flux)
+    return significance, flux
+
+
+def _apart(tile, found):
+    apart = np.ones(len(found), bool)
+    positions = np.column_stack([found.x, found.y])
+    stars = np.column_stack([tile.stars.x, tile.stars.y])
+    for places, limit in ((stars, _SEPARATION), (tile.graves, _GRAVE)):
+        if len(places) and len(found):
+            apart &= cKDTree(places).query(positions)[0] > limit
+    return apart & ~too_dense(tile, found.x, found.y)
+
+
+def too_dense(tile, x, y):
+    """Tell at which positions there are more stars than can be."""
+    s = tile.stars
+    if not len(s) or not len(x):
+        return np.zeros(len(x), bool)
+    tree = cKDTree(np.column_stack([s.x, s.y]))
+    count = tree.query_ball_point(np.column_stack([x, y]),
+                                  _DENSITY_REACH, return_length=True)
+    # The part of the circle that is on the tile.
+    ny, nx = tile.data.shape
+    part = [np.minimum(v + 0.5, _DENSITY_REACH)
+            + np.minimum(n - 0.5 - v, _DENSITY_REACH)
+            for v, n in ((x, nx), (y, ny))]
+    space = np.pi / 4 * np.prod(np.maximum(part, 1), axis=0)
+    return (count * tile.area * _OWN_AREA > space) & (count > 5)
+
+
+def leave_out(tile, threshold):
+    """Remove the weakest of each clump of insignificant stars."""
+    s, p = tile.stars, tile.pairs
+    covariance, _ = tile.covariances()
+    with np.errstate(invalid='ignore'):
+        strength = s.flux / np.sqrt(covariance[:, 0, 0])
+    weak = ~(strength >= threshold) & ~s.listed
+    near = np.hypot(s.x[p.owner] - s.x[p.neighbour],
+                    s.y[p.owner] - s.y[p.neighbour]) < 2
+    rival = (near & weak[p.neighbour]
+             & (s.flux[p.neighbour] < s.flux[p.owner]))
+    weak[p.owner[rival]] = False
+    ny, nx = tile.data.shape
+    weak |= ~s.listed & ((s.x < -1) | (s.y < -1) | (s.x > nx)
+                         | (s.y > ny))
+    gone = np.flatnonzero(weak)
+    places = np.column_stack([s.x[gone], s.y[gone]])
+    tile.dismiss(weak)
+    return places
+
+
+def _vertex(image, x, y):
+    """Return the offsets of the tops of parabolas through three pixels."""
+    ny, nx = image.shape
+    out = []
+    for step_x, step_y in ((1, 0), (0, 1)):
+        here = image[y, x]
+        after = image[np.minimum(y + step_y, ny - 1),
+                      np.minimum(x + step_x, nx - 1)]
+        before = image[np.maximum(y - step_y, 0), np.maximum(x - step_x, 0)]
+        bend = 2 * here - before - after
+        shift = np.divide(0.5 * (after - before), bend, where=bend > 0,
+                          out=np.zeros(x.size))
+        out.append(np.clip(shift, -0.5, 0.5))
+    return out
