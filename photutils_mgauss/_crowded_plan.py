@@ -118,12 +118,14 @@ def run(plan, executor, progress_bar):
         One for each core of the plan, None where a worker failed.
     errors : list of Exception
     """
-    if executor is not None:
-        # Others may be elsewhere: they get no more than their tile.
-        return _collect(executor, Outcome.of, map(plan.job, plan.cores),
-                        progress_bar)
-    with ThreadPoolExecutor(available_cores()) as pool:
-        return _collect(pool, plan.work, plan.cores, progress_bar)
+    if executor is None:
+        with ThreadPoolExecutor(available_cores()) as pool:
+            return run(plan, pool, progress_bar)
+    if isinstance(executor, ThreadPoolExecutor):
+        return _collect(executor, plan.work, plan.cores, progress_bar)
+    # Other workers may be elsewhere: they get no more than their tile.
+    return _collect(executor, Outcome.of, map(plan.job, plan.cores),
+                    progress_bar)
 
 
 def _collect(pool, work, tasks, progress_bar):

@@ -44,7 +44,7 @@ def solve_tile(job):
 def _find_all(tile):
     options = tile.options
     for number, threshold in enumerate(_FALLING):
-        if threshold > options.threshold:
+        if threshold > options.faintest:
             find(tile, threshold, number)
             tile.step(0.05)
             if number == 0:
@@ -53,7 +53,7 @@ def _find_all(tile):
                 tile.widths = size_differences(tile)
             leave_out(tile, 1.0)
     for number in range(options.max_rounds):
-        find(tile, options.threshold, len(_FALLING) + number)
+        find(tile, options.faintest, len(_FALLING) + number)
         tile.step(0.05)
         if number < 2:
             leave_out(tile, 0.7 * options.keep)

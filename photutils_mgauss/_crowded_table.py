@@ -90,7 +90,10 @@ def tabulate(tile, core):
         significance=np.where(s.significance > 0, s.significance, strength),
         crowding=crowding, neighbor_distance=p.distance,
         neighbor_correlation=correlation, iter_detected=s.round)
-    table = _with_repeats(StarTable(columns), tile)
+    table = StarTable(columns).select(
+        s.listed | s.seeded
+        | (np.maximum(s.significance, strength) >= tile.options.threshold))
+    table = _with_repeats(table, tile)
     return table.select(_inside(table.columns, core))
 
 
@@ -111,8 +114,8 @@ def _with_repeats(table, tile):
     if not tile.repeats:
         return table
     number, host, x, y = np.array(tile.repeats).T
-    order = np.argsort(tile.stars.number)
-    row = np.searchsorted(tile.stars.number, host, sorter=order)
+    order = np.argsort(table.columns['number'])
+    row = np.searchsorted(table.columns['number'], host, sorter=order)
     more = table.select(order[row])
     more.columns.update(number=number.astype(int),
                         x_init=x + tile.origin[1], y_init=y + tile.origin[0],

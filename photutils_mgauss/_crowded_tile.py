@@ -50,6 +50,8 @@ _TEMPLATE_HALF = 3
 _ROAM = 0.5
 # A step smaller than this, in pixels and in standard errors, is not taken.
 REST = 2e-5
+# What is known beforehand moves no flux by more standard errors than this.
+_STRONGEST_PULL = 0.5
 # Pixels further than this from the model take no part in the background.
 _BACKGROUND_CLIP = 4.0
 # What is known of each star's stamp.
@@ -70,6 +72,13 @@ class TileOptions:
     max_rounds: int
     find_neighbors: bool = True
     xy_bounds: float = np.inf
+    depth: float = np.inf
+    count_slope: float = 0.0
+
+    @property
+    def faintest(self):
+        """The significance from which stars are fitted, reported or not."""
+        return min(self.depth, self.threshold)
 
 
 @dataclass(frozen=True)
@@ -264,6 +273,7 @@ class Tile:
         _kernels.pair_blocks(p.indptr, p.neighbour, p.twin, s.flux, *place,
                              self.weight, self.blocks)
         self._hold()
+        self._expect()
         self._form_background_equations()
 
     def _hold(self):
@@ -272,6 +282,16 @@ class Tile:
         self.matrix[:, [1, 2], [1, 2]] += s.hold[:, None]
         self.gradient[:, 1] += s.hold * (s.x_init - s.x)
         self.gradient[:, 2] += s.hold * (s.y_init - s.y)
+
+    def _expect(self):
+        """Add what is known of the fluxes of found stars."""
+        s = self.stars
+        # The logarithm of flux**-slope; less than half a standard error, lest
+        # it drive out what may be real.
+        pull = np.minimum(
+            self.options.count_slope / np.maximum(s.flux, 1e-300),
+            _STRONGEST_PULL * np.sqrt(np.maximum(self.matrix[:, 0, 0], 0)))
+        self.gradient[:, 0] -= np.where(s.hold > 0, 0, pull)
 
     def _form_background_equations(self):
         """Form the matrix of the nodes' levels, and the gradient."""

@@ -113,6 +113,15 @@ class CrowdedMixturePhotometry:
     keep : float, optional
         Found stars whose flux, with their neighbours free, has fewer
         standard errors than this are left out again.
+    depth : float, optional
+        Stars down to this significance, if it is below ``threshold``, are
+        fitted along with the others for the sake of these. They are not
+        reported.
+    count_slope : float, optional
+        What is known beforehand of the flux of a found star: numbers of
+        stars fall with it to this negative power. Bright stars do not feel
+        it; of light that could be of either, a faint star takes less. Zero
+        is no knowledge.
     background_size : float or None, optional
         The distance of the nodes of the bilinear background [pix], or None
         if there is no background to fit.
@@ -187,13 +196,15 @@ class CrowdedMixturePhotometry:
     True
     """
 
-    def __init__(self, psf_model, *, threshold=4.5, keep=2.5,
-                 background_size=64, psf_error=0.01, effective_gain=None,
-                 maxiters=3, tile_shape=1536, overlap=48, executor=None,
+    def __init__(self, psf_model, *, threshold=4.5, keep=2.0, depth=3.5,
+                 count_slope=1.5, background_size=64, psf_error=0.01,
+                 effective_gain=None, maxiters=3, tile_shape=1536, overlap=48, executor=None,
                  progress_bar=False, find_neighbors=True, xy_bounds=1.0):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
         self.keep = as_real(keep, 'keep', minimum=0)
+        self.depth = as_real(depth, 'depth', above=0)
+        self.count_slope = as_real(count_slope, 'count_slope', minimum=0)
         self.background_size = background_size
         if background_size is not None:
             self.background_size = as_real(background_size, 'background_size',
@@ -274,7 +285,8 @@ class CrowdedMixturePhotometry:
             floor=float(variance.min()),
             noise=float(np.sqrt(np.median(variance))),
             max_rounds=self.maxiters, find_neighbors=self.find_neighbors,
-            xy_bounds=np.inf if self.xy_bounds is None else self.xy_bounds)
+            xy_bounds=np.inf if self.xy_bounds is None else self.xy_bounds,
+            depth=self.depth, count_slope=self.count_slope)
 
     def _table(self, outcomes, given, unit):
         """Put the stars of the tiles together; empties the list."""

@@ -274,6 +274,7 @@ def completeness_curve(scene, table, strength, low=24):
     table, strength = centre(scene, table), np.asarray(strength, float)
     magnitude = scene.magnitude(table['flux'])
     near = (magnitude >= low - 1) & (magnitude < low + 2)
+    strength = np.nan_to_num(strength)
     levels = np.percentile(strength[near], np.arange(0, 100, 4))
     out = []
     for cut in np.concatenate([[-np.inf], levels]):
