@@ -1,6 +1,6 @@
 """Bright stars of a tile: saturated ones, and the size of the PSF."""
 import numpy as np
-from scipy.ndimage import label
+from scipy.ndimage import find_objects, label
 
 from photutils_mgauss._crowded_stars import Stars
 
@@ -11,12 +11,12 @@ _SATURATED_PIXELS = (2, 2000)
 def seed_saturated(tile):
     """Put a star on each clump of bad pixels that has a star's wings."""
     clumps, n = label(~tile.good)
-    if n == 0:
-        return
-    size = np.bincount(clumps.ravel())[1:]
+    size = np.bincount(clumps.ravel(), minlength=n + 1)[1:]
     low, high = _SATURATED_PIXELS
-    found = [_wing_star(tile, clumps, k + 1)
-             for k in np.flatnonzero((size >= low) & (size <= high))]
+    data = tile.data - tile.background()
+    found = [_wing_star(tile, data, box, clumps[box] == k + 1)
+             for k, box in enumerate(find_objects(clumps))
+             if low <= size[k] <= high]
     found = [star for star in found if star is not None]
     if found:
         x, y, flux, significance = np.array(found).T
@@ -24,8 +24,9 @@ def seed_saturated(tile):
                                 seeded=True, n_rows=tile.psf.n_rows))
 
 
-def _wing_star(tile, clumps, k):
-    y, x = np.nonzero(clumps == k)
+def _wing_star(tile, data, box, clump):
+    y, x = np.nonzero(clump)
+    y, x = y + box[0].start, x + box[1].start
     column, row = round(x.mean()), round(y.mean())
     half = int(max(np.ptp(x), np.ptp(y)) / 2) + 6
     ny, nx = tile.data.shape
@@ -43,7 +44,7 @@ def _wing_star(tile, clumps, k):
     seen = (w > 0) & (stamp > 0.002 * stamp.max())
     if seen.sum() < 8:
         return None
-    ratio = (tile.data[part] - tile.background()[part])[seen] / stamp[seen]
+    ratio = data[part][seen] / stamp[seen]
     flux = np.median(ratio)
     significance = flux * np.sqrt(info)
     if significance < 10 * tile.options.threshold:

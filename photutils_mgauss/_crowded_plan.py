@@ -11,6 +11,9 @@ from photutils_mgauss._crowded_tile import CELL, TileJob, TileOptions
 from photutils_mgauss._local_psf import LocalPSF
 from photutils_mgauss._parallel import available_cores
 
+# The smallest and the largest size of tiles if none is given [pix].
+_TILES = (1024, 2048)
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -37,21 +40,25 @@ class Plan:
     """
     How an image is cut into tiles.
 
+    ``tile_shape`` is the largest shape of a tile, None that of a size that
+    does not need much memory and leaves work for more than one worker.
     ``given`` is None, or x, y, flux and number of the stars of a list.
     """
 
     image: Image
     psf: LocalPSF
     options: TileOptions
-    tile_shape: tuple
+    tile_shape: tuple | None
     overlap: int
     given: tuple | None
 
     @property
     def cores(self):
         """The pixels (y_low, y_high, x_low, x_high) of each tile."""
+        shape = self.image.shape
+        size = min(max(-(-max(shape) // 2), _TILES[0]), _TILES[1])
         rows, columns = (_even_parts(n, tile) for n, tile in zip(
-            self.image.shape, self.tile_shape, strict=True))
+            shape, self.tile_shape or (size, size), strict=True))
         return [(*row, *column) for row in rows for column in columns]
 
     def job(self, core):

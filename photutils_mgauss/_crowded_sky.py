@@ -1,6 +1,7 @@
 """The background of a tile of a crowded field: a mesh of nodes."""
 import numpy as np
 
+from photutils_mgauss import _kernels
 from photutils_mgauss._local_psf import cells
 
 # How strongly neighbouring nodes are tied, in units of a node's information.
@@ -34,7 +35,7 @@ class Mesh:
                                        side='right')
                        for p, nodes in zip(pixels, (self.y, self.x),
                                            strict=True)]
-        self.ties = _TIE * spacing**2 * _differences(*self.shape)
+        self.tie = _TIE * spacing**2
 
     def image(self, level):
         """Return the background (ny, nx) of levels (n,)."""
@@ -45,17 +46,35 @@ class Mesh:
         column, passed = self._columns
         return (1 - passed) * level[:, column] + passed * level[:, column + 1]
 
-    def sums(self, image):
-        """Return the sum (n,) of an image over each node's pixels."""
-        for axis, owner in enumerate(self._owner):
-            # The last node of a small tile may own nothing.
-            seen, start = np.unique(owner, return_index=True)
-            total = np.add.reduceat(image, start, axis=axis)
-            shape = list(total.shape)
-            shape[axis] = self.shape[axis]
-            image = np.zeros(shape)
-            image[(slice(None),) * axis + (seen,)] = total
-        return image.ravel()
+    @property
+    def size(self):
+        """The number of nodes."""
+        return self.shape[0] * self.shape[1]
+
+    def sums(self, weight, residual, background, clip):
+        """Return the sums (3, n) over nodes' pixels of `mesh_sums`."""
+        out = np.empty((self.size, 3))
+        _kernels.mesh_sums(weight, residual, background, *self._owner,
+                           self.shape[1], clip, out)
+        return out.T.copy()
+
+    def n_ties(self):
+        """Return to how many neighbours each node is tied (n,)."""
+        ny, nx = self.shape
+        j, i = np.indices(self.shape)
+        return (4.0 - (j == 0) - (j == ny - 1) - (i == 0)
+                - (i == nx - 1)).ravel()
+
+    def steepness(self, level):
+        """Return the sum (n,) of what each level is above its neighbours."""
+        level = level.reshape(self.shape)
+        out = np.zeros(self.shape)
+        for axis in (0, 1):
+            step = np.diff(level, axis=axis)
+            ends = [(0, 0), (0, 0)]
+            ends[axis] = (1, 1)
+            out -= np.diff(np.pad(step, ends), axis=axis)
+        return out.ravel()
 
     def faint_level(self, data, good):
         """Return the faint percentile (n,) of each node's good pixels."""
@@ -80,7 +99,7 @@ class Mesh:
             seen = data[part][good[part]]
             if seen.size:
                 out[j, i] = np.percentile(seen, which)
-        return out.reshape(len(self.ties), *np.shape(which)).T
+        return out.reshape(self.size, *np.shape(which)).T
 
     def shares(self, x, y):
         """Return the four nodes around positions and their shares (n, 4)."""
@@ -98,17 +117,3 @@ def _lattice(first, size, spacing):
     low = np.floor(first / spacing + 0.5)
     high = max(np.floor((first + size - 1) / spacing + 0.5), low + 1)
     return np.arange(low, high + 1) * float(spacing)
-
-
-def _differences(ny, nx):
-    """Return the matrix of the sum of squared differences of neighbours."""
-    number = np.arange(ny * nx).reshape(ny, nx)
-    out = np.zeros((ny * nx, ny * nx))
-    pairs = ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1]))
-    for after, before in pairs:
-        a, b = after.ravel(), before.ravel()
-        np.add.at(out, (a, a), 1)
-        np.add.at(out, (b, b), 1)
-        out[a, b] -= 1
-        out[b, a] -= 1
-    return out

@@ -64,7 +64,6 @@ def _find_all(tile):
 
 
 def _settle(tile):
-    tile.stars.count[:] = 0
     tile.start_polishing()
     tile.moved = np.zeros(len(tile.stars))
     for _ in range(_FINAL_STEPS):

@@ -2,7 +2,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+
+from photutils_mgauss import _kernels
 
 # Stars further apart than this are not solved for together [pix]; they still
 # see each other through the residual.
@@ -73,23 +74,29 @@ class Neighbours:
     @classmethod
     def of(cls, x, y):
         """List the pairs of stars that are solved for together."""
-        n = x.size
-        pairs = np.empty((0, 2), int)
-        if n > 1:
-            pairs = cKDTree(np.column_stack([x, y])).query_pairs(
-                _PAIR_DISTANCE, output_type='ndarray')
-        i = np.concatenate([pairs[:, 0], pairs[:, 1]])
-        j = np.concatenate([pairs[:, 1], pairs[:, 0]])
-        gap = np.hypot(x[i] - x[j], y[i] - y[j])
-        order = np.lexsort((j, gap, i))
-        place = np.empty(i.size, np.int64)
-        place[order] = np.arange(i.size)
-        twin = place[np.roll(np.arange(i.size), len(pairs))][order]
-        i, j, gap = i[order], j[order], gap[order]
-        indptr = np.searchsorted(i, np.arange(n + 1))
-        has = indptr[1:] > indptr[:-1]
-        nearest, distance = np.full(n, -1), np.full(n, np.inf)
-        nearest[has] = j[indptr[:-1][has]]
+        cell, columns, start = _cells(x, y)
+        place = (x, y, _PAIR_DISTANCE, cell, columns, start,
+                 np.argsort(cell, kind='stable'))
+        count = np.empty(x.size, np.int64)
+        _kernels.count_near(*place, count)
+        indptr = np.concatenate([[0], np.cumsum(count)])
+        neighbour, twin = np.empty((2, indptr[-1]), np.int64)
+        gap = np.empty(indptr[-1])
+        _kernels.list_near(*place, indptr, neighbour, gap, twin)
+        has = count > 0
+        nearest, distance = np.full(x.size, -1), np.full(x.size, np.inf)
+        nearest[has] = neighbour[indptr[:-1][has]]
         distance[has] = gap[indptr[:-1][has]]
-        return cls(indptr.astype(np.int64), j.astype(np.int64), twin, i,
-                   nearest, distance)
+        return cls(indptr, neighbour, twin,
+                   np.repeat(np.arange(x.size), count), nearest, distance)
+
+
+def _cells(x, y):
+    """Return each star's cell, how many are in a row, where each starts."""
+    row, column = (
+        (np.floor((v - v.min()) / _PAIR_DISTANCE).astype(int) + 1
+         if v.size else np.empty(0, int)) for v in (y, x))
+    columns = column.max(initial=0) + 2
+    cell = row * columns + column
+    count = np.bincount(cell, minlength=(row.max(initial=0) + 2) * columns)
+    return cell, columns, np.concatenate([[0], np.cumsum(count)])

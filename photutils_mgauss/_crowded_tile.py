@@ -135,7 +135,7 @@ class Tile:
                          size or max(self.data.shape))
         # Stars hide the sky.
         self.level = (self.mesh.faint_level(self.data, self.good) if size
-                      else np.zeros(len(self.mesh.ties)))
+                      else np.zeros(self.mesh.size))
         self.limits = (self.mesh.limits(self.data, self.good, self.noise)
                        if size else (-np.inf, np.inf))
 
@@ -298,19 +298,18 @@ class Tile:
         if self.options.background_size:
             # All pixels count for the information: stars are coupled through
             # all of theirs. Those far from the model say nothing of the sky.
-            weight = np.where(self.weight * self.residual**2
-                              <= _BACKGROUND_CLIP**2, self.weight, 0)
-            sky = weight * (self.residual + self.background())
-            information, seen, total = (
-                self.mesh.sums(image) for image in (self.weight, weight, sky))
+            information, seen, total = self.mesh.sums(
+                self.weight, self.residual, self.background(),
+                _BACKGROUND_CLIP)
             gradient = total - seen * self.level
         else:
             self.reach[:] = 0
             information = gradient = np.zeros(self.level.size)
         # Nodes without pixels follow their neighbours.
-        ties = self.mesh.ties / self.noise**2
-        self.mesh_matrix = np.diag(information) + ties
-        self.mesh_gradient = gradient - ties @ self.level
+        self.tie = self.mesh.tie / self.noise**2
+        self.mesh_diagonal = information + self.tie * self.mesh.n_ties()
+        self.mesh_gradient = gradient - self.tie * self.mesh.steepness(
+            self.level)
 
     def refresh(self):
         """Bring everything up to date with the stars."""
@@ -326,8 +325,9 @@ class Tile:
         matrix = self.matrix * (1 + damping * np.eye(3))
         _kernels.solve_joint(
             matrix, self.gradient, p.indptr, p.neighbour, self.blocks,
-            *self._own_node(), self.reach, self.mesh_matrix,
-            self.mesh_gradient, _TOLERANCE, _CG_STEPS, step, level_step)
+            *self._own_node(), self.reach, self.mesh_diagonal, self.tie,
+            self.mesh.shape[1], self.mesh_gradient, _TOLERANCE, _CG_STEPS,
+            step, level_step)
         for k, gone in ((1, s.x - s.x_init), (2, s.y - s.y_init)):
             move = np.clip(step[:, k], -_MAX_MOVE, _MAX_MOVE)
             step[:, k] = np.where(np.isfinite(s.bound), np.clip(

@@ -3046,6 +3046,84 @@ def add_stars(chosen, sign, x, y, flux, left, bottom, width, offset, wing,
 
 
 @_jit
+def mesh_sums(weight, residual, background, rows, columns, n_columns, clip,
+              out):
+    """
+    Put sums over the pixels of each node of a background into out (m, 3).
+
+    In order: the weight; the weight of pixels within clip standard errors of
+    the model; and that times what of those pixels is no star's. Pixels
+    belong to the nodes of rows (ny,) and columns (nx,).
+    """
+    out[:] = 0
+    for j in range(weight.shape[0]):
+        first = rows[j] * n_columns
+        for i in range(weight.shape[1]):
+            w, r = weight[j, i], residual[j, i]
+            node = first + columns[i]
+            out[node, 0] += w
+            if w * r * r <= clip * clip:
+                out[node, 1] += w
+                out[node, 2] += w * (r + background[j, i])
+
+
+@_jit
+def count_near(x, y, reach, cell, columns, start, order, count):
+    """
+    Put the number of other points within reach of each into count (n,).
+
+    Points lie in cells as wide as reach, in rows of so many columns with
+    nothing in the outermost; cell (n,) is where each is, order lists the
+    points of cell c from start[c] to start[c + 1].
+    """
+    for i in range(x.size):
+        count[i] = 0
+        for row in range(-1, 2):
+            middle = cell[i] + row * columns
+            for at in range(start[middle - 1], start[middle + 2]):
+                j = order[at]
+                if j != i and sqrt((x[j] - x[i])**2
+                                   + (y[j] - y[i])**2) <= reach:
+                    count[i] += 1
+
+
+@_jit
+def list_near(x, y, reach, cell, columns, start, order, indptr, neighbour,
+              distance, twin):
+    """
+    List the points within reach of each, nearest first.
+
+    Those of point i go into neighbour from indptr[i] on, with their distance;
+    twin says where the same pair stands the other way round. For the rest
+    see `count_near`.
+    """
+    for i in range(x.size):
+        end = indptr[i]
+        for row in range(-1, 2):
+            middle = cell[i] + row * columns
+            for at in range(start[middle - 1], start[middle + 2]):
+                j = order[at]
+                gap = sqrt((x[j] - x[i])**2 + (y[j] - y[i])**2)
+                if j == i or gap > reach:
+                    continue
+                to = end
+                while to > indptr[i] and (distance[to - 1] > gap or (
+                        distance[to - 1] == gap and neighbour[to - 1] > j)):
+                    neighbour[to] = neighbour[to - 1]
+                    distance[to] = distance[to - 1]
+                    to -= 1
+                neighbour[to] = j
+                distance[to] = gap
+                end += 1
+    for i in range(x.size):
+        for pair in range(indptr[i], indptr[i + 1]):
+            j = neighbour[pair]
+            for other in range(indptr[j], indptr[j + 1]):
+                if neighbour[other] == i:
+                    twin[pair] = other
+
+
+@_jit
 def own_equations(flux, left, bottom, width, offset, jets, weight, residual,
                   matrix, gradient, reach):
     """
@@ -3166,17 +3244,31 @@ def _invert_3x3(a, out):
 
 
 @_jit
+def _apply_mesh(v, mesh, tie, columns, out):
+    """Multiply by the matrix of a background, as of `solve_joint`."""
+    for m in range(v.size):
+        column = m % columns
+        near = 0.0
+        if column > 0:
+            near += v[m - 1]
+        if column < columns - 1:
+            near += v[m + 1]
+        if m >= columns:
+            near += v[m - columns]
+        if m < v.size - columns:
+            near += v[m + columns]
+        out[m] = mesh[m] * v[m] - tie * near
+
+
+@_jit
 def _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node, share,
-                 reach, mesh, out, mesh_out):
+                 reach, mesh, tie, columns, out, mesh_out):
     """
     Multiply by the joint normal matrix of stars and background.
 
     Returns the product of v and the outcome.
     """
-    for m in range(mesh_v.size):
-        mesh_out[m] = 0.0
-        for n in range(mesh_v.size):
-            mesh_out[m] += mesh[m, n] * mesh_v[n]
+    _apply_mesh(mesh_v, mesh, tie, columns, mesh_out)
     product = 0.0
     for i in range(v.shape[0]):
         level = 0.0
@@ -3222,7 +3314,7 @@ def _precondition(inverse, mesh, r, mesh_r, z, mesh_z):
         z[i, 0], z[i, 1], z[i, 2] = z0, z1, z2
         product += r0 * z0 + r1 * z1 + r2 * z2
     for m in range(mesh_r.size):
-        mesh_z[m] = mesh_r[m] / mesh[m, m]
+        mesh_z[m] = mesh_r[m] / mesh[m]
         product += mesh_r[m] * mesh_z[m]
     return product
 
@@ -3243,16 +3335,17 @@ def _extend(x, scale, y):
 
 @_jit
 def solve_joint(matrix, gradient, indptr, neighbour, blocks, node, share,
-                reach, mesh, mesh_gradient, tolerance, max_steps, step,
-                mesh_step):
+                reach, mesh, tie, columns, mesh_gradient, tolerance,
+                max_steps, step, mesh_step):
     """
     Solve the joint normal equations by preconditioned conjugate gradients.
 
     Stars couple to their neighbours (`pair_blocks`) and to the four nodes
     node (n, 4) of the background around them, with the bilinear shares
-    share (n, 4); mesh (m, m) is the background's own matrix. Each star's own
-    block is the preconditioner; stars whose block is singular do not move.
-    Returns the number of steps.
+    share (n, 4). The background's own matrix has the diagonal mesh (m,) and
+    -tie between nodes that are neighbours, in rows of so many columns. Each
+    star's own block is the preconditioner; stars whose block is singular do
+    not move. Returns the number of steps.
     """
     n = gradient.shape[0]
     inverse = np.empty((n, 3, 3))
@@ -3271,7 +3364,8 @@ def solve_joint(matrix, gradient, indptr, neighbour, blocks, node, share,
         if not rz > goal:
             return count
         alpha = rz / _apply_joint(v, mesh_v, matrix, indptr, neighbour,
-                                  blocks, node, share, reach, mesh, a, mesh_a)
+                                  blocks, node, share, reach, mesh, tie,
+                                  columns, a, mesh_a)
         _add_scaled(step.reshape(-1), alpha, v.reshape(-1))
         _add_scaled(mesh_step, alpha, mesh_v)
         _add_scaled(r.reshape(-1), -alpha, a.reshape(-1))

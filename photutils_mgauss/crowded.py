@@ -136,12 +136,13 @@ class CrowdedMixturePhotometry:
     maxiters : int, optional
         The largest number of searches at the final threshold.
     tile_shape : int or (ny, nx) tuple of int, optional
-        The image is solved in even tiles of at most this many pixels.
-        Smaller ones need less memory, spread over more workers, and cost
-        more: each sees 96 to 128 pixels beyond its borders if the background
-        is fitted.
+        The image is solved in even tiles of at most this many pixels; by
+        default half of its longer side, but at least 1024 and at most 2048.
+        Smaller tiles need less memory, spread over more workers, and cost
+        more.
     overlap : int, optional
-        How far a tile sees beyond its borders [pix].
+        How far a tile sees beyond its borders [pix], at least; with less
+        than two nodes of the background the result depends on the tiles.
     executor : `~concurrent.futures.Executor`, optional
         Where tiles are solved; by default a pool of threads on all cores.
     progress_bar : bool, optional
@@ -198,8 +199,9 @@ class CrowdedMixturePhotometry:
 
     def __init__(self, psf_model, *, threshold=4.5, keep=2.0, depth=3.5,
                  count_slope=1.5, background_size=64, psf_error=0.01,
-                 effective_gain=None, maxiters=3, tile_shape=1536, overlap=48, executor=None,
-                 progress_bar=False, find_neighbors=True, xy_bounds=1.0):
+                 effective_gain=None, maxiters=3, tile_shape=None,
+                 overlap=128, executor=None, progress_bar=False,
+                 find_neighbors=True, xy_bounds=1.0):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
         self.keep = as_real(keep, 'keep', minimum=0)
@@ -215,7 +217,9 @@ class CrowdedMixturePhotometry:
             self.effective_gain = as_real(effective_gain, 'effective_gain',
                                           above=0)
         self.maxiters = as_integer(maxiters, 'maxiters', minimum=1)
-        self.tile_shape = as_shape(tile_shape, 'tile_shape', minimum=32)
+        self.tile_shape = tile_shape
+        if tile_shape is not None:
+            self.tile_shape = as_shape(tile_shape, 'tile_shape', minimum=32)
         self.overlap = as_integer(overlap, 'overlap', minimum=8)
         self.executor = executor
         self.progress_bar = bool(progress_bar)

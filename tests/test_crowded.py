@@ -154,8 +154,13 @@ def test_every_pixel_belongs_to_its_nearest_node():
         [node_x.ravel(), node_y.ravel() + 1e-6])).query(
             np.column_stack([x.ravel() + 1e-3, y.ravel() + 2e-3]))
     image = np.random.default_rng(1).normal(size=x.shape)
-    want = np.bincount(nearest_node, image.ravel(), node_x.size)
-    assert_allclose(mesh.sums(image), want, atol=1e-10)
+    weight = np.abs(image)
+    sums = mesh.sums(weight, image, 0 * image + 2, 1.2)
+    near = weight * image**2 <= 1.2**2
+    for total, part in zip(sums, (weight, weight * near,
+                                  weight * near * (image + 2)), strict=True):
+        want = np.bincount(nearest_node, part.ravel(), node_x.size)
+        assert_allclose(total, want, atol=1e-10)
 
 
 def test_wings_are_those_of_the_exact_gaussian(rng):
@@ -572,13 +577,16 @@ def test_the_solution_of_conjugate_gradients_solves_the_equations():
     node = np.tile(np.arange(4), (n, 1))
     reach = rng.normal(size=(n, 3))
     share = np.full((n, 4), 0.25)
+    # The nodes are a square, of which each is tied to two.
+    full[15:, 15:] = np.diag(rng.uniform(3, 4, 4)) - 0.7 * (
+        np.abs(np.subtract.outer([0, 1, 2, 3], [0, 1, 2, 3])) % 3 > 0)
     full[:15, 15:] = np.repeat(reach.ravel()[:, None] / 4, 4, axis=1)
     full[15:, :15] = full[:15, 15:].T
     right = rng.normal(size=3 * n + 4)
     step, level = np.empty((n, 3)), np.empty(4)
     _kernels.solve_joint(
         matrix, right[:15].reshape(n, 3).copy(), indptr, j.astype(np.int64),
-        blocks, node, share, reach, full[15:, 15:].copy(), right[15:].copy(),
-        1e-12, 200, step, level)
+        blocks, node, share, reach, np.diag(full)[15:].copy(), 0.7, 2,
+        right[15:].copy(), 1e-12, 200, step, level)
     assert_allclose(np.concatenate([step.ravel(), level]),
                     np.linalg.solve(full, right), rtol=1e-6)
