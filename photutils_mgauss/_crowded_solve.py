@@ -8,7 +8,7 @@ from photutils_mgauss._crowded_tile import REST, Tile
 
 # Finding starts with the brightest stars.
 _FALLING = (80, 25, 10)
-_FINAL_STEPS = 6
+_FIRST_STEPS, _FINAL_STEPS = 3, 5
 
 
 def solve_tile(job):
@@ -64,11 +64,18 @@ def _find_all(tile):
 
 
 def _settle(tile):
+    _polish(tile, _FIRST_STEPS)
+    # Some have faded, or become one with another.
+    leave_out(tile, tile.options.keep)
+    _polish(tile, _FINAL_STEPS)
+    # Some may have moved out of the middle of their stamps.
+    tile.refresh()
+
+
+def _polish(tile, n_steps):
     tile.start_polishing()
     tile.moved = np.zeros(len(tile.stars))
-    for _ in range(_FINAL_STEPS):
+    for _ in range(n_steps):
         tile.moved = tile.polish(0.02)
         if not (tile.moved > REST).any():
             break
-    # Some may have moved out of the middle of their stamps.
-    tile.refresh()

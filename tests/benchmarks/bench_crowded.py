@@ -13,10 +13,11 @@ pulls of each program, and median position errors beside ours on each one's
 list and on the stars of both; ``given`` the same with all programs that can
 on SExtractor's list of its windowed positions (crowdsource moves no stars of
 a given list); ``curve`` completeness over false stars at 24-25 mag;
-``area`` CPU seconds and memory of growing images, the scene repeated where
-it is smaller. SExtractor, PSFEx and IRAF run if they are installed,
-crowdsource with ``--crowdsource PYTHON``, an interpreter that has it and the
-requirements of this package. ``--crop`` takes a corner of the scene for all,
+``area`` CPU seconds and memory of growing images, corners of the scene and,
+where that is smaller, scenes simulated by this package (`crowded_area.py`;
+``--sizes 9216`` takes half an hour). SExtractor, PSFEx and IRAF run if they
+are installed, crowdsource with ``--crowdsource PYTHON``, an interpreter that
+has it and the requirements of this package. ``--crop`` takes a corner of the scene for all,
 ``--small`` one for crowdsource and SExtractor's list, ``--tiny`` one for
 IterativePSFPhotometry, which is slow.
 
@@ -27,12 +28,12 @@ true PSF) or, without that file, made with our PSF, which is up to 10 %
 smaller.
 """
 import argparse
-import multiprocessing
-import resource
+import shutil
 import tempfile
 import warnings
 from pathlib import Path
 
+import crowded_area
 import crowded_peers as peers
 import numpy as np
 from astropy.table import Table
@@ -92,10 +93,16 @@ class Bench:
             Scene.load(args.crowded, min(size, whole.size)).bounded(self.psf)
             for size in (args.small, args.tiny))
         self.sky = np.percentile(whole.images['sci'], 20)
-        self.model = self._psfex() if peers.PSFEX else None
+        self._model = None
         self._ours = {}
         self._sextractor = None
         self._crowdsource = None
+
+    def psfex(self):
+        """Return the PSFEx model, None without PSFEx."""
+        if self._model is None and peers.PSFEX:
+            self._model = self._psfex()
+        return self._model
 
     def _psfex(self):
         sparse = Scene.load(self.args.sparse)
@@ -114,7 +121,7 @@ class Bench:
         if self._sextractor is None:
             self._sextractor = {} if not peers.SEXTRACTOR else (
                 peers.sextractor(self.scene.images['sci'],
-                                 self.folder / 'sextractor', self.model))
+                                 self.folder / 'sextractor', self.psfex()))
         return self._sextractor
 
     def crowdsource(self):
@@ -202,37 +209,38 @@ def curve_part(bench):
 
 def area_part(bench):
     """CPU seconds and memory of images of growing area, each a process."""
-    context = multiprocessing.get_context('spawn')
-    print('\n size     stars  CPU s  peak memory [GB]')
+    args = bench.args
+    print('\npixels a side; stars listed, and those brighter than 23 mag over '
+          'the truth;\ntimes and peak memory, of which images and programs; '
+          f'{args.threads} threads\n size    stars  < 23    '
+          'CPU s  wall s  memory [GB]')
     seconds = []
-    for size in bench.args.sizes:
-        copies = -(-size // bench.scene.size)
-        images = {name: np.tile(image, (copies, copies))[:size, :size]
-                  for name, image in bench.scene.images.items()
-                  if name != 'vartrue'}
-        with context.Manager() as manager:
-            queue = manager.Queue()
-            worker = context.Process(target=_area_work, args=(
-                bench.psf, images, queue))
-            worker.start()
-            worker.join()
-            n, cpu, memory = queue.get(timeout=10)
-        seconds.append(cpu)
-        print(f'{size:5} {n:9} {cpu:6.1f} {memory:6.2f}', flush=True)
+    for size in args.sizes:
+        folder = bench.folder / f'area{size}'
+        if size <= bench.scene.size:
+            limit = 10**(0.4 * (bench.scene.zero - crowded_area.LIMIT))
+            truth = bench.scene.truth
+            inside = (truth['x'] < size - 0.5) & (truth['y'] < size - 0.5)
+            crowded_area.save(
+                folder, {name: image[:size, :size] for name, image
+                         in bench.scene.images.items()}, bench.psf, limit,
+                int((inside & (truth['flux'] > limit)).sum()))
+        else:
+            crowded_area.run(
+                folder, '--simulate', str(size), str(size), '--components',
+                str(args.components), '--radius', str(args.radius))
+        took = crowded_area.measure(folder, args.threads)
+        shutil.rmtree(folder)
+        seconds.append(took['cpu'])
+        print(f'{size:5} {took["stars"]:8} {took["bright"]:5.1%} '
+              f'{took["cpu"]:8.1f} {took["wall"]:7.1f}  {took["peak"]:.2f} of '
+              f'which {took["start"]:.2f}', flush=True)
     if len(seconds) > 1:
-        area = 2 * np.log(bench.args.sizes)
+        area = 2 * np.log(args.sizes)
         slope = np.polyfit(area, np.log(seconds), 1)[0]
         print(f'time grows as area to the power {slope:.2f}; the last gives '
-              f'{seconds[-1] * 9216 * 9232 / bench.args.sizes[-1]**2:.0f} '
-              'CPU s for 9216 x 9232')
-
-
-def _area_work(psf, images, queue):
-    part = slice(64), slice(64)
-    reduce(psf, {name: image[part] for name, image in images.items()})
-    table, seconds = peers.timed(reduce, psf, images)
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    queue.put((len(table), seconds, memory))
+              f'{seconds[-1] * 9216 * 9232 / args.sizes[-1]**2:.0f} CPU s for '
+              '9216 x 9232')
 
 
 def main():
@@ -250,6 +258,7 @@ def main():
     parser.add_argument('--crowdsource', metavar='PYTHON')
     parser.add_argument('--sizes', type=int, nargs='+',
                         default=[512, 1024, 2048])
+    parser.add_argument('--threads', type=int, default=2)
     args = parser.parse_args()
     peers.report_missing(args.crowdsource)
     parts = {'peers': peers_part, 'given': given_part, 'curve': curve_part,
