@@ -17,9 +17,9 @@ a given list); ``curve`` completeness over false stars at 24-25 mag;
 where that is smaller, scenes simulated by this package (`crowded_area.py`;
 ``--sizes 9216`` takes half an hour). SExtractor, PSFEx and IRAF run if they
 are installed, crowdsource with ``--crowdsource PYTHON``, an interpreter that
-has it and the requirements of this package. ``--crop`` takes a corner of the scene for all,
-``--small`` one for crowdsource and SExtractor's list, ``--tiny`` one for
-IterativePSFPhotometry, which is slow.
+has it and the requirements of this package. ``--crop`` takes a corner of the
+scene for all, ``--small`` one for crowdsource and SExtractor's list,
+``--tiny`` one for IterativePSFPhotometry, which is slow.
 
 Differences of centring conventions, smooth over the field, are taken out of
 every list with a cubic fitted on bright stars. The bound is that of the
