@@ -59,7 +59,7 @@ class Image:
 
     def part(self, window=np.s_[:, :]):
         """Return data and variance of a window, both 0 at bad pixels."""
-        data, error = (np.array(image[window], float)
+        data, error = (np.array(image[window], float, order='C')
                        for image in (self.data, self.error))
         bad = ~(np.isfinite(data) & np.isfinite(error) & (error > 0))
         if self.bad is not None:

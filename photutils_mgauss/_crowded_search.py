@@ -23,6 +23,9 @@ _GRAVE = 0.5
 # lies.
 _DENSITY_REACH = 6.0
 _OWN_AREA = 0.7
+# So often, what has most of its neighbours within twice that distance in
+# something extended counts as part of it, too.
+_SPREADING = 3
 
 
 def find(tile, threshold, found_in):
@@ -84,6 +87,22 @@ def too_dense(tile, x, y):
             for v, n in ((x, nx), (y, ny))]
     space = np.pi / 4 * np.prod(np.maximum(part, 1), axis=0)
     return (count * tile.area * _OWN_AREA > space) & (count > 5)
+
+
+def extended(tile):
+    """Tell which stars are where, and beside where, there are too many."""
+    s = tile.stars
+    out = too_dense(tile, s.x, s.y)
+    if not out.any():
+        return out
+    first, second = cKDTree(np.column_stack([s.x, s.y])).query_pairs(
+        2 * _DENSITY_REACH, output_type='ndarray').T
+    count = np.bincount(np.concatenate([first, second]), minlength=len(s))
+    for _ in range(_SPREADING):
+        beside = (np.bincount(first, out[second], len(s))
+                  + np.bincount(second, out[first], len(s)))
+        out |= (beside > 2) & (2 * beside > count)
+    return out
 
 
 def leave_out(tile, threshold):

@@ -5,7 +5,7 @@ import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._crowded_search import too_dense
+from photutils_mgauss._crowded_search import extended
 
 # Photutils' own bits.
 PARTIAL, OUTSIDE, NO_FLUX, NO_CONVERGENCE, NO_COVARIANCE = 1, 2, 4, 8, 16
@@ -18,6 +18,10 @@ NOT_SEEN, REPEATED = 1 << 19, 1 << 20
 _STILL = 0.02
 # Correlation with the nearest neighbour's flux from which a star is a blend.
 _BLEND_CORRELATION = 0.5
+
+# A star is none if what is left in its pixels is many times the noise and no
+# small part of its light.
+_BAD_CHI2, _BAD_SHARE = 3.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -90,11 +94,18 @@ def tabulate(tile, core):
         significance=np.where(s.significance > 0, s.significance, strength),
         crowding=crowding, neighbor_distance=p.distance,
         neighbor_correlation=correlation, iter_detected=s.round)
-    table = StarTable(columns).select(
-        s.listed | s.seeded
-        | (np.maximum(s.significance, strength) >= tile.options.threshold))
+    table = StarTable(columns).select(_significant(tile, strength))
     table = _with_repeats(table, tile)
     return table.select(_inside(table.columns, core))
+
+
+def _significant(tile, strength):
+    """Tell which stars are to be reported."""
+    s, threshold = tile.stars, tile.options.threshold
+    # A position that is fitted, too, makes noise two degrees of freedom
+    # stronger.
+    return (s.listed | s.seeded | (s.significance >= threshold)
+            | (strength >= np.sqrt(threshold**2 + 2)))
 
 
 def _inside(columns, core):
@@ -159,10 +170,17 @@ def _flags(tile, quality, error, correlation):
                                     * error[:, 0])),
             (NO_COVARIANCE, ~np.isfinite(error).all(axis=1)),
             (SATURATED, (quality[:, 5] < 0.5)),
-            (NOT_A_STAR, too_dense(tile, s.x, s.y)),
+            (NOT_A_STAR, extended(tile) | _unlike_a_star(tile, quality)),
             (BLENDED, np.abs(correlation) > _BLEND_CORRELATION)):
         flags[where] |= bit
     return flags
+
+
+def _unlike_a_star(tile, quality):
+    """Tell under which stars there is something else."""
+    count, chi2, deviation = quality[:, :3].T
+    return ((chi2 > _BAD_CHI2 * np.maximum(count - 3, 1))
+            & (deviation > _BAD_SHARE * tile.stars.flux))
 
 
 def as_qtable(table, unit, meta):
