@@ -499,7 +499,7 @@ def test_numbers_of_stars_make_faint_fluxes_fainter_and_no_bright_ones():
 
 @pytest.mark.parametrize('kind', ['f4', '>f4', 'i4', 'u2', 'F'])
 def test_any_kind_of_numbers_gives_the_same_stars(kind):
-    data, error = expose(draw([20.3], [21.1], [2e4], (62, 62), level=60), 3)
+    data, error = expose(draw([20.3], [21.1], [2e4], (62, 62), level=60.0), 3)
     data = np.rint(data)
     kinds = {'F': np.asfortranarray(data)}
     other = kinds[kind] if kind in kinds else data.astype(kind)
