@@ -15,7 +15,6 @@ from photutils_mgauss import __version__
 
 # What is no option of a run.
 _NOT_STORED = ('run', 'quiet', 'overwrite')
-_TABLES = ('.ecsv', '.fits')
 
 
 class Progress:
@@ -289,13 +288,6 @@ def write_table(table, path, record):
         # FITS has no electrons; astropy notes them down all the same.
         warnings.filterwarnings('ignore', 'The unit .* could not be saved')
         table.write(draft)
-
-
-def check_table_name(path):
-    """Raise unless tables can be written under this name."""
-    if path.suffix not in _TABLES:
-        msg = f'{path}: must end with {" or ".join(_TABLES)}'
-        raise ValueError(msg)
 
 
 def read_table(path):

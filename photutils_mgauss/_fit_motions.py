@@ -174,7 +174,7 @@ def _with_references(scene):
     priors = build_priors(_select(catalogue, use, use.sum()), stars[use],
                           scene.origin[:, stars[use]], scene.working_year,
                           sightings.unit, n_star_parameters(options))
-    priors = _add_parallax_prior(priors, scene, stars)
+    priors = _add_parallax_prior(priors, scene)
     relative = not anchors.any()
     if relative:
         anchors = np.ones(n, dtype=bool)
@@ -205,7 +205,7 @@ def _hold_out(stars, options):
     return np.sort(rng.choice(stars, n, replace=False))
 
 
-def _add_parallax_prior(priors, scene, references):
+def _add_parallax_prior(priors, scene):
     """Give stars of unknown parallax the one expected of them."""
     if scene.options.parallax != 'prior':
         return priors
@@ -434,7 +434,7 @@ def _review(scene, state, problem, frames, fits_floor):
             return replace(state, floor=floor), True
     estimates = solve_all(problem, frames.correction, frames.factor,
                           scene.options.executor, judge=True)
-    dropped = _discrepant(scene, state, problem, frames, estimates)
+    dropped = _discrepant(scene, problem, frames)
     if len(dropped):
         return replace(state, dropped=np.union1d(state.dropped,
                                                  dropped)), True
@@ -473,7 +473,7 @@ def prior_rank(priors):
                                  hermitian=True)
 
 
-def _discrepant(scene, state, problem, frames, estimates):
+def _discrepant(scene, problem, frames):
     """
     Return references whose catalogue values the data contradict.
 
