@@ -2,7 +2,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from photutils_mgauss._joint import (
     Estimates,
@@ -21,6 +20,7 @@ from photutils_mgauss._stacked import invert_2x2
 from photutils_mgauss.alignment import (
     Frames,
     Gauge,
+    chi2_limit,
     floor_variance,
     solve_frames,
     worst_outliers,
@@ -450,9 +450,9 @@ def _review(scene, state, problem, frames, fits_floor):
 def _inconsistent(scene, problem, estimates):
     """Return stars (n,) that no more rejections can make agree."""
     dof = 2 * (problem.weights[0] > 0).sum(axis=0) - problem.n_parameters
-    tail = 2 * stats.norm.sf(scene.options.clip)
     chi2 = np.nansum(estimates.raw, axis=0)
-    out = (dof > 0) & (chi2 > stats.chi2.isf(tail, np.maximum(dof, 1)))
+    out = (dof > 0) & (chi2 > chi2_limit(scene.options.clip,
+                                         np.maximum(dof, 1)))
     # References agree with their catalogue, or are none any more.
     out[problem.priors.stars] &= ~scene.anchors[problem.priors.stars] | (
         scene.relative)
@@ -492,8 +492,7 @@ def _discrepant(scene, problem, frames):
                         residuals=True)
     bound = data_chi2(with_it, alone) + alone.priors.chi2(with_it.values)
     rise = bound - data_chi2(without, free)
-    limit = stats.chi2.isf(2 * stats.norm.sf(scene.options.clip),
-                           prior_rank(alone.priors))
+    limit = chi2_limit(scene.options.clip, prior_rank(alone.priors))
     worst = np.nan_to_num(rise / limit, nan=0.0)
     # A few at a time: one bad reference pulls the frame from the others.
     most = max(1, len(stars) // 20)
