@@ -10,7 +10,7 @@ from astropy.wcs import WCS
 
 from photutils_mgauss import Epoch
 
-# Observing times of Table 1 of Nie et al.
+# Observing times of Table 2 of Nie et al.
 TIMES = Time(['2024-12-12T08:07:10', '2026-05-30T17:27:18',
               '2026-08-11T02:49:27', '2026-08-11T05:50:40',
               '2027-08-09T07:50:24', '2027-08-09T09:19:18',

@@ -12,6 +12,7 @@ from astropy.table import QTable
 from astropy.time import Time
 from astropy.wcs import WCS as FITSWCS
 from numpy.testing import assert_allclose, assert_array_equal
+from photutils.psf import PSFPhotometry
 from scipy.ndimage import label
 
 from photutils_mgauss._detector_effects import bleed, pattern
@@ -202,8 +203,16 @@ def test_a_magnitude_is_the_flux_of_its_band():
                     'mag_g': [20.0] * u.mag, 'mag_r': [19.0] * u.mag})
     for band, mag in (('g', 20), ('r', 19)):
         scene = simulate(stars, Exposure(band=band), instrument=SMALL, rng=1)
-        assert_allclose(scene.truth['flux'].to_value(u.electron),
+        assert_allclose(scene.truth['flux'],
                         150 * CSST_BANDS[band].rate(mag))
+
+
+def test_a_true_flux_starts_photutils_as_it_is():
+    scene = simulate(one_star(50.2, 60.1, 1e5), instrument=SMALL, rng=1)
+    table = PSFPhotometry(scene.psf.local_model(50, 60), 7)(
+        scene.image - scene.background,
+        init_params=scene.truth['x', 'y', 'flux'])
+    assert_allclose(table['flux_fit'], 1e5, rtol=0.02)
 
 
 def test_sources_without_brightness_are_refused():
@@ -543,6 +552,7 @@ def test_a_scene_is_read_back_from_extensions(small_scene, tmp_path):
     truth = QTable.read(paths[1])
     assert_allclose(truth['x'].value, small_scene.truth['x'].value)
     assert truth['pmra'].unit == u.mas / u.yr
+    assert truth['flux'].unit == header['BUNIT'] == u.electron
     x, y = truth['x'].value, truth['y'].value
     ra, dec = small_scene.wcs(x, y, with_bounding_box=False)
     with asdf.open(paths[2]) as file:
