@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 @dataclass(frozen=True)
 class InjectionResult:
     """
-    What became of artificial stars, as `inject_and_recover` returns it.
+    What became of artificial stars.
 
     Attributes
     ----------
@@ -25,6 +25,24 @@ class InjectionResult:
         robust scatter of position ``position_scatter`` [pix], of relative
         flux ``flux_scatter``, its median ``flux_bias``, and the scatter of
         position errors over the reported ones, ``position_pull``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from photutils_mgauss import (CrowdedMixturePhotometry,
+    ...                               GaussianMixture, GriddedMixturePSF,
+    ...                               inject_and_recover)
+    >>> mixture = GaussianMixture([1], [[0, 0]], [[[0.7, 0], [0, 0.8]]])
+    >>> phot = CrowdedMixturePhotometry(GriddedMixturePSF([mixture],
+    ...                                                   [(0, 0)]))
+    >>> data = np.random.default_rng(1).normal(100, 10, (60, 60))
+    >>> result = inject_and_recover(phot, data, (3000, 9000), rng=2,
+    ...                             error=np.full((60, 60), 10.0))
+    >>> result.curves.colnames[:4]
+    ['flux_min', 'flux_max', 'n_injected', 'completeness']
+    >>> lost = result.stars[~result.stars['recovered']]
+    >>> len(lost)
+    0
     """
 
     stars: QTable

@@ -627,11 +627,6 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     >>> result.curves['completeness']
     <Column name='completeness' dtype='float64' length=1>
     1.0
-    >>> result.stars[~result.stars['recovered']]['x_true', 'y_true']
-    <QTable length=0>
-     x_true  y_true
-    float64 float64
-    ------- -------
     """
     rng = np.random.default_rng(rng)
     image = Image.of(data, error, mask)
