@@ -78,13 +78,11 @@ def add_reading(parser):
         'all images or one for each.')
     group.add_argument('--ext', metavar='NAME',
                        help='extension with the image: 1, SCI or SCI,2')
-    for name, words in (('error', 'standard deviations'),
-                        ('weight', 'inverse variances'),
+    for name, words in (('error', 'standard deviations of the pixels'),
+                        ('weight', 'inverse variances of the pixels'),
                         ('flags', 'flags of bad pixels'),
                         ('wcs', 'WCS, as ASDF or FITS header')):
-        group.add_argument(f'--{name}', nargs='+', metavar='FILE',
-                           help=f'{words} of the pixels' if name != 'wcs'
-                           else words)
+        group.add_argument(f'--{name}', nargs='+', metavar='FILE', help=words)
     group.add_argument('--good-bits', type=int, metavar='BITS',
                        help='sum of the bits of the flags that do not make '
                             'a pixel bad')

@@ -7,6 +7,7 @@ import pytest
 from astropy import units as u
 from hypothesis import given, settings
 from numpy.testing import assert_allclose, assert_array_equal
+from psf_grids import make_grid, some_mixture
 from strategies import SETTINGS, numbers
 
 from photutils_mgauss import (
@@ -17,26 +18,6 @@ from photutils_mgauss import (
 )
 
 Y, X = np.mgrid[:15, :15]
-
-
-def some_mixture(rng, k=3):
-    """Return a random mixture of k Gaussians."""
-    return GaussianMixture.from_stddevs(
-        rng.dirichlet(np.ones(k)), rng.normal(0, 0.2, (k, 2)),
-        rng.uniform(0.8, 3, (k, 2)), rng.uniform(-0.5, 0.5, k))
-
-
-def make_grid(x_grid=(0, 30, 100), y_grid=(0, 50), *, seed=3, shuffle=False,
-              **kwargs):
-    """Return a grid of random mixtures of 2 or 3 Gaussians."""
-    rng = np.random.default_rng(seed)
-    positions = [(x, y) for y in y_grid for x in x_grid]
-    mixtures = [some_mixture(rng, 2 + i % 2) for i in range(len(positions))]
-    if shuffle:
-        order = rng.permutation(len(positions))
-        positions = [positions[i] for i in order]
-        mixtures = [mixtures[i] for i in order]
-    return GriddedMixturePSF(mixtures, positions, **kwargs)
 
 
 def reference_blend(psf, x_0, y_0):
