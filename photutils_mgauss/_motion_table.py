@@ -15,10 +15,10 @@ from photutils_mgauss._joint import (
     cross_covariance,
     parallax_leak,
     parts,
-    run,
     solve_all,
 )
 from photutils_mgauss._parallax import tdb
+from photutils_mgauss._parallel import map_parallel
 from photutils_mgauss._references import FIXED
 from photutils_mgauss._stacked import invert_2x2
 from photutils_mgauss._tangent_plane import directions
@@ -312,7 +312,8 @@ def _add_quality(table, fit, solved):
 def _add_leak(table, fit, solved):
     """Add what an ignored parallax does to the motion; return its flag."""
     problem = replace(fit.problem, observer=fit.scene.observer)
-    leaks = run(fit.scene.options.executor, _local_leak, parts(problem))
+    leaks = map_parallel(_local_leak, parts(problem),
+                         executor=fit.scene.options.executor)
     correlation, leak = (np.concatenate(some, axis=-1)
                          for some in zip(*leaks, strict=True))
     strongest = np.where(solved, np.abs(correlation).max(axis=0), np.nan)
