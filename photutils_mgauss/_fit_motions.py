@@ -278,16 +278,16 @@ def build_problem(scene, state):
     """Return the `Problem` of the present maps, masks and floors."""
     sightings, transform = scene.sightings, scene.transform
     offsets = np.empty_like(sightings.places)
+    weights = np.empty_like(sightings.covariance)
     for e, coefficients in enumerate(state.maps):
         aligned = transform.apply(coefficients, sightings.places[:, e])
         offsets[:, e] = aligned - scene.origin
+        weights[:, e] = np.where(
+            state.used[e], invert_2x2(*measured(scene, state, e)), 0.0)
     if scene.drift is not None:
         stars, drift = scene.drift
         offsets[..., stars] -= drift
-    offsets = np.nan_to_num(offsets)
-    weights = np.stack([
-        np.where(state.used[e], invert_2x2(*measured(scene, state, e)), 0.0)
-        for e in range(len(state.maps))], axis=1)
+    np.nan_to_num(offsets, copy=False)
     priors = scene.priors.without(state.dropped)
     return Problem(
         offsets, weights, scene.origin, scene.dt,

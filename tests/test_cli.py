@@ -119,7 +119,7 @@ def test_images_become_psfs_of_their_own_stars(chain):
     for number in (1, 2):
         path = chain / f'night{number}_psf.fits'
         psf = GriddedMixturePSF.read(path)
-        assert psf.n_components == 5
+        assert psf.n_components == 6
         record = json.loads(fits.getheader(path)['MGRUN'])
         assert record['command'] == 'psf'
         assert record['version'] == __version__
