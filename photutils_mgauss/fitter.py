@@ -12,10 +12,12 @@ Photutils fits groups of stars without derivatives; here each star of a group
 contributes those of its own PSF.
 """
 import numpy as np
+from astropy.modeling.fitting import fitter_unit_support
 from scipy.linalg import cho_solve, cholesky
 
 from photutils_mgauss import _compat, _kernels
 from photutils_mgauss._psf_model import PSFModel
+from photutils_mgauss._validation import as_integer
 
 __all__ = ['MixtureFitter']
 
@@ -24,6 +26,8 @@ _MESSAGES = {
     2: 'The sum of squares does not get smaller any more.',
     3: 'The next step is expected to be below the tolerance.',
 }
+
+_MAX_STEPS = 100
 
 # Of the expected next step, see _State.length.
 _TOLERANCE = 1e-6
@@ -93,8 +97,8 @@ class MixtureFitter:
         weights : array_like, optional
             One over their standard deviations. Without, the covariance is
             scaled by the scatter of the residuals.
-        maxiter : int, optional
-            The largest number of steps.
+        maxiter : int or None, optional
+            The largest number of steps; None stands for 100.
         inplace : bool, optional
             Whether to change ``model`` itself.
 
@@ -106,9 +110,16 @@ class MixtureFitter:
         Raises
         ------
         ValueError
-            If nothing is free, a parameter is tied, or the arrays differ in
-            size or hold values that are not finite.
+            If nothing is free, a parameter is tied, ``maxiter`` is below 1,
+            or the arrays differ in size or hold values that are masked or
+            not finite.
         """
+        return self._fit_with_units(model, x, y, z=z, weights=weights,
+                                    maxiter=as_max_steps(maxiter, 'maxiter'),
+                                    inplace=inplace)
+
+    @fitter_unit_support
+    def _fit_with_units(self, model, x, y, z, *, weights, maxiter, inplace):
         problem = _Problem(model, x, y, z, weights)
         state, status, n_steps = _minimize(problem, maxiter)
         self.fit_info = {
@@ -117,6 +128,13 @@ class MixtureFitter:
         fitted = model if inplace else model.copy()
         fitted.parameters = problem.full(state.values)
         return fitted
+
+
+def as_max_steps(value, name):
+    """Return the largest number of steps, given it or None."""
+    if value is None:
+        return _MAX_STEPS
+    return as_integer(value, name, minimum=1)
 
 
 class _State:
@@ -159,9 +177,11 @@ class _Problem:
 
     def __init__(self, model, x, y, z, weights):
         self.base, self.n_sources = _compat.group_members(model)
-        self.x, self.y, self.z = (np.ravel(a).astype(float)
-                                  for a in (x, y, z))
-        self.weights = None if weights is None else np.ravel(weights)
+        self.x, self.y, self.z = (
+            _as_plain(a, name).astype(float)
+            for a, name in ((x, 'x'), (y, 'y'), (z, 'z')))
+        self.weights = None if weights is None else _as_plain(weights,
+                                                              'weights')
         self.start = np.array(model.parameters, dtype=float)
         names = model.param_names
         # Each access to these properties visits all parameters of a group.
@@ -234,6 +254,15 @@ class _Problem:
         covariance = _inverse(state.matrix, state.scale)
         return covariance * (1 if self.weights is not None
                              else state.chi2 / dof)
+
+
+def _as_plain(values, name):
+    """Return values flat; a mask that hides any is refused."""
+    if np.ma.is_masked(values):
+        msg = (f'{name} must not have masked values, got '
+               f'{np.ma.count_masked(values)}')
+        raise ValueError(msg)
+    return np.ravel(np.ma.getdata(values))
 
 
 def _inverse(matrix, scale):

@@ -30,8 +30,8 @@ from photutils_mgauss._psf_model import (
     PARAMETER_COLUMNS,
     PSFModel,
     flat_points,
+    plain_positions,
     split_flux,
-    strip_units,
     with_unit,
 )
 from photutils_mgauss._validation import as_choice, as_floats, as_shape
@@ -418,7 +418,7 @@ n_components=1)>
         `~numpy.ndarray`
             The PSF, in the unit of ``flux``.
         """
-        x, y, x_0, y_0 = strip_units([x, y, x_0, y_0])
+        x, y, x_0, y_0 = plain_positions(x, y, x_0, y_0)
         flux, unit = split_flux(flux)
         if np.shape(x_0) != np.shape(y_0):
             x_0, y_0 = np.broadcast_arrays(x_0, y_0)

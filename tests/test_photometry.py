@@ -5,6 +5,8 @@ from functools import partial
 import astropy
 import numpy as np
 import pytest
+from astropy import units as u
+from astropy.modeling.fitting import TRFLSQFitter
 from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import QTable
 from astropy.utils import minversion
@@ -189,7 +191,6 @@ def test_quantities_and_nddata_give_units(grid, rng):
                                           init_params=start)
     start['flux'] = start['flux'] * 1.0
     nddata = NDData(data, uncertainty=StdDevUncertainty(error), unit='nJy')
-    from astropy import units as u
     start['flux'] = start['flux'] << u.nJy
     theirs, ours = both(grid, nddata, call={'init_params': start})
     check_same(theirs, ours)
@@ -409,6 +410,31 @@ def test_the_fitter_does_not_mind_the_unit_of_flux_or_the_origin(
     assert_allclose(found, [found[0]] * 4, rtol=0, atol=1e-8)
     step = np.array(found[0]) - [1, 5.3, 4.8]
     assert (abs(step) < [0.03, 0.03, 0.03]).all()
+
+
+def test_the_fitter_takes_units_as_fitters_of_astropy_do():
+    y, x = np.mgrid[:11, :11]
+    model = MultiGaussianPSFModel(mixture(0.3), flux=0.8 * u.nJy,
+                                  x_0=5 * u.pix, y_0=5 * u.pix)
+    data = mixture(0.3).render(11, 5.3, 4.8) * u.nJy
+    call = model, x * u.pix, y * u.pix, data
+    ours, theirs = (fitter(*call) for fitter in (MixtureFitter(),
+                                                 TRFLSQFitter()))
+    for name in ('flux', 'x_0', 'y_0'):
+        got, want = (getattr(fit, name).quantity for fit in (ours, theirs))
+        assert got.unit == want.unit
+        assert_allclose(got.value, want.value, atol=1e-6)
+
+
+def test_the_fitter_refuses_masked_pixels_and_takes_an_empty_mask():
+    y, x = np.mgrid[:11, :11]
+    data = np.ma.array(mixture(0.3).render(11, 5.3, 4.8), mask=False)
+    model = MultiGaussianPSFModel(mixture(0.3), x_0=5, y_0=5)
+    assert_allclose(MixtureFitter()(model, x, y, data).x_0, 5.3, atol=1e-6)
+    data[3, 3] = np.ma.masked
+    with pytest.raises(ValueError, match='z must not have masked values, '
+                                         'got 1'):
+        MixtureFitter()(model, x, y, data)
 
 
 def test_any_executor_gives_the_same_table(grid, rng):

@@ -546,6 +546,27 @@ def test_row_numbers_of_photutils_are_not_identifiers(scene):
     assert_allclose(np.sort(one['pmra'].value), np.sort(two['pmra'].value))
 
 
+def test_identifiers_count_however_wrong_the_pointings_are(rng):
+    truth = make_truth(rng, n_stars=200, n_qso=100)
+    epochs = observe(truth, rng, offset=10_000.0)
+    one, two = (ProperMotionFitter(references='qso', match_by=match_by).fit(
+        epochs).stars for match_by in ('auto', 'id'))
+    assert len(one) == len(two) == 300
+    assert_allclose(one['pmra'].value, two['pmra'].value)
+
+
+def test_an_epoch_with_few_known_stars_is_named(solution, rng):
+    truth = make_truth(rng, n_stars=200, n_qso=100)
+    epochs = observe(truth, rng, times=TIMES[[0, 3, 6]], offset=0.0)
+    ra, dec = epochs[2].wcs.wcs.crval
+    epochs[2] = epochs[2].with_wcs(tan_wcs(ra, dec + 0.01))
+    fit = ProperMotionFitter(references='qso', match_by='sky').fit(epochs)
+    few = [note for note in fit.notes if note.startswith('Only ')]
+    assert len(few) == 1
+    assert 'epoch 2' in few[0]
+    assert not any(note.startswith('Only ') for note in solution.notes)
+
+
 def test_threads_and_one_thread_agree_exactly(scene, quasars):
     _, epochs = scene
     with ThreadPoolExecutor(3) as pool:
