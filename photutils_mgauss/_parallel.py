@@ -11,7 +11,7 @@ def available_cores():
         return os.cpu_count() or 1
 
 
-def map_chunks(function, arrays, executor, *, chunk_size=None):
+def map_chunks(function, arrays, executor, *, chunk_size=None, most=None):
     """
     Call a function on slices of arrays and join the lists it returns.
 
@@ -27,6 +27,9 @@ def map_chunks(function, arrays, executor, *, chunk_size=None):
         where one slice is all there is.
     chunk_size : int, optional
         The length of a slice; by default there are four for each core.
+    most : int, optional
+        The longest slice by default. Short ones end together, on cores that
+        are not equally free.
 
     Returns
     -------
@@ -38,7 +41,7 @@ def map_chunks(function, arrays, executor, *, chunk_size=None):
                f'{executor!r:.80}')
         raise TypeError(msg)
     n, cores = len(arrays[0]), available_cores()
-    size = chunk_size or max(1, -(-n // (4 * cores)))
+    size = chunk_size or max(1, min(-(-n // (4 * cores)), most or n))
     starts = range(0, n, size)
     columns = [[array[i:i + size] for i in starts] for array in arrays]
     if executor is not None:
