@@ -6,6 +6,7 @@ finds where to start it, and the rest turns shape numbers into mixtures and
 back.
 """
 from functools import partial
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
@@ -36,11 +37,12 @@ _ASTROMETRY = (1.0, 10.0, 100.0)
 _ASTROMETRY_ROUNDS = 8
 _ASTROMETRY_STEPS = 4
 _ASTROMETRY_TOLERANCE = 1e-2
-# The steps every split gets, and the better half again; how many of the best
-# go on at the end; and the steps of fits with fewer Gaussians than asked for,
-# which need not converge.
-_TRIAL_STEPS = 6
-_FINALISTS = 2
+# The steps every split gets, and the better half again; the fraction of them,
+# and the least number, that go on at the end; and the steps of fits with fewer
+# Gaussians than asked for, which need not converge.
+_TRIAL_STEPS = 8
+_FINALISTS = 0.15
+_LEAST_FINALISTS = 2
 _PREVIEW_STEPS = 40
 
 
@@ -207,13 +209,16 @@ def search(stamp, problem, spaces):
     improved = partial(_run_all, stamp, problem, spaces)
     best = run(stamp, problem, spaces, _core(stamp, problem))
     for k in range(2, problem.n_components + 1):
-        trials = improved(_splits(best.shapes, problem), _TRIAL_STEPS)
-        half = max(2, len(trials.costs) // 2)
-        trials = improved(trials.shapes[:half], _TRIAL_STEPS)
-        last = k == problem.n_components
-        n_best, steps = (_FINALISTS, _MAX_STEPS) if last else (
-            1, _PREVIEW_STEPS)
-        best = improved(trials.shapes[:n_best], steps).best
+        starts = _splits(best.shapes, problem)
+        n = len(starts)
+        for share in (n, max(2, n // 2)):
+            starts = improved(starts[:share], _TRIAL_STEPS).shapes
+        if k < problem.n_components:
+            n_best, steps = 1, _PREVIEW_STEPS
+        else:
+            n_best = max(_LEAST_FINALISTS, ceil(_FINALISTS * n))
+            steps = _MAX_STEPS
+        best = improved(starts[:n_best], steps).best
     return best
 
 

@@ -101,6 +101,8 @@ def speed(stamps, arguments):
 def cost(stamps, arguments):
     """Print how often the cost is that of the best of five scipy starts."""
     for k, step in ((3, 1), (5, arguments.thin_5)):
+        if str(k) not in arguments.cost_of:
+            continue
         chosen = stamps[::arguments.thin * step]
         ratio = np.array([
             fit_mixture(s, k).chi2 / min(
@@ -238,6 +240,8 @@ def main():
                         help='compare the cost on every so many stamps')
     parser.add_argument('--thin-5', type=int, default=4,
                         help='and on fewer by this factor for K = 5')
+    parser.add_argument('--cost-of', default='3,5',
+                        help='the numbers of Gaussians of the part cost')
     arguments = parser.parse_args()
     if arguments.stamps:
         with np.load(arguments.stamps) as file:
