@@ -22,6 +22,7 @@ from photutils_mgauss.matching import (
 TRIALS = 300   # maps through a few stars that are tried for a plane
 FAR = 0.01     # of the field: how far a star may be from its place
 AGREED = 0.25  # least part of the stars that has to agree with a map
+COMMON = 0.5   # part of an epoch's stars in another one, if all is well
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,12 +203,24 @@ def _same_objects(detections, tolerance):
         return False
     matches, _ = match_ids([one.ids for one in detections])
     places = matches.take([one.plane for one in detections])
-    if not (np.isfinite(places[0]).sum(axis=0) > 1).any():
-        return False
     common = np.isfinite(places[0]).sum(axis=0) > 1
-    spread = (np.nanmax(places[..., common], axis=1)
-              - np.nanmin(places[..., common], axis=1)).max(axis=0)
+    if not common.any():
+        return False
+    places = _without_offsets(places[..., common])
+    spread = (np.nanmax(places, axis=1)
+              - np.nanmin(places, axis=1)).max(axis=0)
     return np.median(spread) < tolerance.pointing
+
+
+def _without_offsets(places):
+    """Return places (2, E, n) less what each epoch is off in common."""
+    for _ in range(5):  # Stars that are missing from epochs blur the mean.
+        away = places - np.nanmean(places, axis=1, keepdims=True)
+        offset = np.array([[np.median(one[np.isfinite(one)])
+                            if np.isfinite(one).any() else 0.0
+                            for one in axis] for axis in away])
+        places = places - offset[..., None]
+    return places
 
 
 def _match_on_plane(detections, catalogue, tolerance):
@@ -272,6 +285,19 @@ def _check_common(matches, detections):
         msg = ('epochs must have stars in common, got none that is in two '
                'of them')
         raise ValueError(msg)
+
+
+def few_in_common(sightings):
+    """Return a sentence for each epoch most of whose stars are alone."""
+    seen = sightings.matches.seen
+    shared = (seen & (seen.sum(axis=0) > 1)).sum(axis=1)
+    return tuple(
+        f'Only {some} of the {total} stars of epoch {e} were found in another '
+        'epoch: if there should be more, its pointing may be off by more '
+        'than matching looks for; see match_by and match_radius.'
+        for e, (some, total) in enumerate(zip(shared, seen.sum(axis=1),
+                                              strict=True))
+        if some < COMMON * total)
 
 
 def _find_references(sightings, tolerance):

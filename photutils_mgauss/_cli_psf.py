@@ -3,8 +3,7 @@ from photutils_mgauss import _cli_tools as tools
 
 _SUFFIXES = ('.fits', '.asdf')
 
-# The PSF of an image, unless options say otherwise.
-_FROM_STARS = {'n_components': 5, 'degree': 3, 'radius': 10.0}
+_RADIUS = 10.0
 
 
 def add(commands):
@@ -35,10 +34,10 @@ def add_fit(parser):
     group = parser.add_argument_group('the fit')
     group.add_argument('--n-components', type=tools.number_or_auto,
                        metavar='K', help='number of Gaussians, or auto, '
-                       'which tries (default: 5 for images, 3 for PSF files)')
+                       'which tries (default: 6 for images, 3 for PSF files)')
     group.add_argument('--degree', type=tools.number_or_auto, metavar='D',
                        help='degree of the polynomials over the detector, or '
-                            'auto (default: 3, lowered for few stars)')
+                            'auto (default: 4, lowered for few stars)')
     group.add_argument('--radius', type=tools.positive, metavar='PIXELS',
                        help='radius of the stamps (default: 10 for images)')
     group.add_argument('--min-snr', type=tools.positive, default=50,
@@ -106,8 +105,10 @@ def from_file(path, options):
 def from_stars(image, options):
     """Return the grid of an image's own stars, and facts about it."""
     from photutils_mgauss.field import fit_mixture_field
-    fit = {name: value if getattr(options, name) is None
-           else getattr(options, name) for name, value in _FROM_STARS.items()}
+    given = {name: getattr(options, name)
+             for name in ('n_components', 'degree', 'radius')}
+    fit = {'radius': _RADIUS}
+    fit |= {name: value for name, value in given.items() if value is not None}
     stars = _choose(image, fit['radius'], options)
     field = fit_mixture_field(
         image.without_sky, stars, error=image.noise.total, mask=image.mask,

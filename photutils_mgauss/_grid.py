@@ -216,27 +216,6 @@ def make_grid(mixtures, grid_xypos, scales):
     return Grid(x_grid, y_grid, *stack, scales), order
 
 
-def split_seams(positions):
-    """
-    Move lines of nodes that lie on another line one pixel further.
-
-    Where two chips meet, grids that cover both have a last line of the one
-    and a first line of the other, at one coordinate. The next pixel belongs
-    to the other chip.
-    """
-    if len(np.unique(positions, axis=0)) == len(positions):
-        return positions
-    ends = np.flatnonzero(np.diff(positions[:, 0]) < 0)
-    n = ends[0] + 1 if ends.size else len(positions)
-    x, y = positions[:n, 0].copy(), positions[::n, 1].copy()
-    whole = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    if not np.array_equal(whole, positions):
-        return positions
-    for axis in (x, y):
-        axis[1:] += np.diff(axis) == 0
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-
-
 def _check_mixtures(mixtures):
     for mixture in mixtures:
         if not (mixture is None or isinstance(mixture, GaussianMixture)):

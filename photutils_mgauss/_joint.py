@@ -31,12 +31,13 @@ evaluated at the mean place of a star, not at each measured one: the two agree
 once the maps have converged, and only with a common basis are shifts of all
 frames together exactly undetermined, as they must be.
 """
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
+from functools import reduce
+from operator import add
 
 import numpy as np
 
-from photutils_mgauss._parallel import available_cores
+from photutils_mgauss._parallel import map_parallel
 from photutils_mgauss._stacked import (
     apply,
     apply_transposed,
@@ -200,18 +201,6 @@ class Problem:
         return columns
 
 
-def run(executor, function, items):
-    """Map ``function`` over ``items``, in threads unless told otherwise."""
-    items = list(items)
-    if executor is not None:
-        return list(executor.map(function, items))
-    cores = available_cores()
-    if cores == 1 or len(items) < 2:
-        return [function(item) for item in items]
-    with ThreadPoolExecutor(cores) as pool:
-        return list(pool.map(function, items))
-
-
 def parts(problem):
     """Yield the problem in parts that fit into a processor's cache."""
     for start in range(0, problem.n_stars, CHUNK):
@@ -357,8 +346,8 @@ def _block_diagonal(blocks):
 
 def reduce_all(problem, executor=None):
     """Return the `Reduced` equations of a whole problem."""
-    results = run(executor, reduce_stars, parts(problem))
-    return sum(results[1:], results[0])
+    return reduce(add, map_parallel(reduce_stars, parts(problem),
+                                    executor=executor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -507,9 +496,9 @@ def _project(stars, e, c):
 def solve_all(problem, correction, factor, executor=None, *,
               residuals=False, leverage=False, judge=False):
     """Return the `Estimates` of all stars of a problem."""
-    results = run(executor, solve_stars, (
-        Task(part, correction, factor, residuals, leverage, judge)
-        for part in parts(problem)))
+    tasks = (Task(part, correction, factor, residuals, leverage, judge)
+             for part in parts(problem))
+    results = list(map_parallel(solve_stars, tasks, executor=executor))
     return Estimates(*(_join(results, field.name)
                        for field in fields(Estimates)))
 

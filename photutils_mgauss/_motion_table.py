@@ -11,13 +11,14 @@ from photutils_mgauss._fit_motions import (
     prior_rank,
 )
 from photutils_mgauss._joint import (
+    CHUNK,
     cross_covariance,
     parallax_leak,
     parts,
-    run,
     solve_all,
 )
 from photutils_mgauss._parallax import tdb
+from photutils_mgauss._parallel import map_parallel
 from photutils_mgauss._references import FIXED
 from photutils_mgauss._stacked import invert_2x2
 from photutils_mgauss._tangent_plane import directions
@@ -67,17 +68,36 @@ def visibility_periods(years, used):
     return count
 
 
-def at_epoch(fit, year):
+def at_epoch(fit, year, stars):
     """
-    Return parameters (p, n) and covariances moved to a Julian year.
+    Return parameters (p, k) and covariances of stars at a Julian year.
 
     Positions are plane coordinates, no longer relative to an origin.
     """
     move = _shift_in_time(fit, year)
-    values = move @ fit.estimates.values
-    values[:2] += fit.scene.origin
-    half = np.tensordot(move, fit.estimates.covariance, axes=1)
+    values = move @ fit.estimates.values[:, stars]
+    values[:2] += fit.scene.origin[:, stars]
+    half = np.tensordot(move, fit.estimates.covariance[..., stars], axes=1)
     return values, np.einsum('ijn,kj->ikn', half, move)
+
+
+def _parameters(fit, year):
+    """
+    Return parameters (p, n) and covariances of all stars, in local axes.
+
+    In parts, since the matrices that turn the axes are as large as the
+    covariances themselves.
+    """
+    plane = fit.scene.sightings.plane
+    values = np.empty_like(fit.estimates.values)
+    covariance = np.empty_like(fit.estimates.covariance)
+    for start in range(0, values.shape[1], CHUNK):
+        some = slice(start, start + CHUNK)
+        moved = at_epoch(fit, year, some)
+        if plane is not None:
+            moved = turned(plane, *moved)
+        values[:, some], covariance[..., some] = moved
+    return values, covariance
 
 
 def _shift_in_time(fit, year):
@@ -127,7 +147,7 @@ def star_covariance(fit, stars, ref_year):
     change = np.repeat(_shift_in_time(fit, ref_year)[None], len(stars), 0)
     plane = fit.scene.sightings.plane
     if plane is not None:
-        places = at_epoch(fit, ref_year)[0][:2, stars]
+        places = at_epoch(fit, ref_year, stars)[0][:2]
         change = _turns(plane, places, size).transpose(2, 0, 1) @ change
     covariance = np.einsum('kij,kjlm,lnm->kiln', change, covariance, change)
     order = [k for k in FROM_OURS if k < size] if (
@@ -182,14 +202,9 @@ def _catalogue_motions(sightings, stars):
 def star_table(fit, ref_year):
     """Return the `~astropy.table.QTable` of the stars."""
     sightings = fit.scene.sightings
-    values, covariance = at_epoch(fit, ref_year)
-    if sightings.plane is not None:
-        values, covariance = turned(sightings.plane, values, covariance)
     flags, solved = _flags(fit)
-    values[:, ~solved] = np.nan
-    covariance[..., ~solved] = np.nan
     table = QTable({'id': sightings.names})
-    _add_parameters(table, fit, values, covariance)
+    _add_parameters(table, fit, ref_year, solved)
     table['ref_epoch'] = np.full(len(table), ref_year) * u.yr
     _add_quality(table, fit, solved)
     if not fit.scene.options.parallax and sightings.plane is not None:
@@ -201,8 +216,11 @@ def star_table(fit, ref_year):
     return table
 
 
-def _add_parameters(table, fit, values, covariance):
+def _add_parameters(table, fit, ref_year, solved):
     unit = u.Unit(fit.scene.sightings.unit)
+    values, covariance = _parameters(fit, ref_year)
+    values[:, ~solved] = np.nan
+    covariance[..., ~solved] = np.nan
     has_parallax = bool(fit.scene.options.parallax)
     values, covariance, extra = _gaia_order(values, covariance, has_parallax,
                                             fit.scene.options.acceleration)
@@ -294,18 +312,23 @@ def _add_quality(table, fit, solved):
 def _add_leak(table, fit, solved):
     """Add what an ignored parallax does to the motion; return its flag."""
     problem = replace(fit.problem, observer=fit.scene.observer)
-    leaks = run(fit.scene.options.executor, parallax_leak, parts(problem))
+    leaks = map_parallel(_local_leak, parts(problem),
+                         executor=fit.scene.options.executor)
     correlation, leak = (np.concatenate(some, axis=-1)
                          for some in zip(*leaks, strict=True))
-    inverse = _inverse_2x2(fit.scene.sightings.plane.local_jacobian(
-        fit.scene.origin))
-    leak = np.einsum('ijn,jn->in', inverse, leak)
     strongest = np.where(solved, np.abs(correlation).max(axis=0), np.nan)
     table['parallax_motion_corr'] = strongest
     for k, name in enumerate(('pmra', 'pmdec')):
         table[f'{name}_per_parallax'] = np.where(solved, leak[k],
                                                  np.nan) / u.yr
     return 128 * (np.nan_to_num(strongest) > STRONG).astype(int)
+
+
+def _local_leak(problem):
+    """Return correlations (2, n) and leaks (2, n) in local axes."""
+    correlation, leak = parallax_leak(problem)
+    inverse = _inverse_2x2(problem.plane.local_jacobian(problem.origin))
+    return correlation, np.einsum('ijn,jn->in', inverse, leak)
 
 
 def _mean_flux(flux):
@@ -385,12 +408,16 @@ def _add_counts(table, fit, unit):
     lost = sightings.usable & ~state.used & scene.anchors
     lost |= sightings.usable & np.isin(np.arange(len(stars)), state.dropped)
     table['n_rejected'] = lost.sum(axis=1)
-    square = np.where(used, fit.estimates.residuals, np.nan)**2
-    with np.errstate(invalid='ignore'):
-        count = np.isfinite(square).sum(axis=2)
-        rms = np.sqrt(np.nansum(square, axis=2) / np.where(count, count,
-                                                           np.nan))
-    table['rms'] = rms.T * unit
+    table['rms'] = [_rms(fit.estimates.residuals[:, e, used[e]])
+                    for e in range(len(used))] * unit
+
+
+def _rms(residuals):
+    """Return the rms (2,) of residuals (2, k), NaN if there are none."""
+    known = residuals[:, np.isfinite(residuals).all(axis=0)]
+    if not known.size:
+        return [np.nan, np.nan]
+    return np.sqrt(np.mean(known**2, axis=1))
 
 
 def residual_table(fit):
@@ -409,7 +436,7 @@ def residual_table(fit):
                     'row': sightings.matches.rows[at]})
     years = np.broadcast_to(sightings.years, finite.shape)[at]
     table['time'] = years * u.yr
-    _add_aligned(table, fit, at, finite, unit)
+    _add_aligned(table, fit, at, unit)
     residual = np.where(finite, full.residuals, np.nan)
     left_out = _leave_one_out(full, covariance)
     for k, name in enumerate(('dra', 'ddec')):
@@ -421,7 +448,7 @@ def residual_table(fit):
     return table
 
 
-def _add_aligned(table, fit, at, finite, unit):
+def _add_aligned(table, fit, at, unit):
     scene, sightings = fit.scene, fit.scene.sightings
     aligned = np.stack([scene.transform.apply(one, sightings.places[:, e])
                         for e, one in enumerate(fit.state.maps)], axis=1)

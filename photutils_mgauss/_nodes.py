@@ -13,8 +13,6 @@ projected, for many places of the star within a pixel, onto flux and position,
 A shift that is the same at all phases is a matter of definition; half the
 range over the phases is the error.
 """
-from dataclasses import dataclass
-
 import numpy as np
 from astropy.table import QTable
 from scipy.ndimage import map_coordinates, spline_filter
@@ -25,78 +23,12 @@ from photutils_mgauss._validation import as_choice, as_integer, as_real
 from photutils_mgauss.fitting import fit_mixture
 from photutils_mgauss.shapes import adaptive_moments
 
-__all__ = ['NodeImages', 'fit_nodes', 'plain_report']
+__all__ = ['fit_nodes', 'plain_report']
 
 # Phases of the star within a pixel, along each axis.
 _PHASES = 4
 # Stars are rarely fitted on more than 11 x 11 pixels.
 _PHASE_RADIUS = 5.5
-
-
-@dataclass(frozen=True, eq=False)
-class NodeImages:
-    """
-    PSF images at M places.
-
-    Attributes
-    ----------
-    images : (M, ny, nx) `~numpy.ndarray`
-        Flux densities; all zero or all NaN where there is no PSF.
-    positions : (M, 2) `~numpy.ndarray`
-        The places (x, y) [pix].
-    oversampling : (y, x) tuple of int
-        Samples per unit of ``unit``.
-    origin : (x, y) tuple of float
-        The sample that is the star's position.
-    unit : float
-        The length that ``oversampling`` divides [pix]; 1 unless the sampling
-        is not an integer.
-    """
-
-    images: np.ndarray
-    positions: np.ndarray
-    oversampling: tuple = (1, 1)
-    origin: tuple = None
-    unit: float = 1.0
-
-    @property
-    def centre(self):
-        """The origin, by default the middle of the images."""
-        if self.origin is not None:
-            return tuple(self.origin)
-        return tuple((n - 1) / 2 for n in self.images.shape[:0:-1])
-
-    def widest_radius(self):
-        """
-        Return the radius of the circle that stays off the edge [unit].
-
-        Two samples are left: some libraries put fill values into the first.
-        """
-        ny, nx = self.images.shape[1:]
-        x, y = self.centre
-        return min((min(x, nx - 1 - x) - 2) / self.oversampling[1],
-                   (min(y, ny - 1 - y) - 2) / self.oversampling[0])
-
-    @property
-    def blank(self):
-        """Which places have no PSF, (M,) bool."""
-        flat = self.images.reshape(len(self.images), -1)
-        return ((flat == 0) | np.isnan(flat)).all(axis=1)
-
-    def filled_borders(self):
-        """
-        Return the mask (M, ny, nx) of borders that hold one value only.
-
-        A row of exactly equal numbers was not measured.
-        """
-        mask = np.zeros(self.images.shape, bool)
-        for axis in (1, 2):
-            lines = np.moveaxis(self.images, axis, 0)
-            constant = (lines == lines[..., :1]).all(axis=-1)
-            outer = np.logical_and.accumulate(constant)
-            outer |= np.logical_and.accumulate(constant[::-1])[::-1]
-            np.moveaxis(mask, axis, 0)[outer] = True
-        return mask & ~self.blank[:, None, None]
 
 
 def fit_nodes(nodes, n_components, *, radius=None, start='centre',

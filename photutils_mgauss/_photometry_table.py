@@ -24,9 +24,11 @@ _BOUND_TOLERANCE = 0.01
 
 
 def plain(column):
-    """Return a column as a plain array without its unit."""
-    return np.asarray(column.value if isinstance(column, Quantity)
+    """Return a column as a plain array without unit, NaN where masked."""
+    values = np.array(column.value if isinstance(column, Quantity)
                       else column, dtype=float)
+    values[getattr(column, 'mask', False)] = np.nan
+    return values
 
 
 def define_flags(result, fit_shape, data_shape):

@@ -1,6 +1,7 @@
 """Figures of PSF fields, on the Axes they are given."""
 import numpy as np
 
+from photutils_mgauss._plot_style import VERMILION
 from photutils_mgauss._validation import as_choice, as_integer
 from photutils_mgauss.shapes import adaptive_moments
 
@@ -81,7 +82,7 @@ def _mark_stars(ax, stars):
                facecolors='none', edgecolors='k', linewidths=0.7,
                label='used')
     ax.scatter(stars['x'][~used], stars['y'][~used], s=12, marker='x',
-               color='#D55E00', linewidths=0.7, label='dropped')
+               color=VERMILION, linewidths=0.7, label='dropped')
 
 
 def _plot_mean_residual(ax, field):

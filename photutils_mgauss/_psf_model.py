@@ -3,7 +3,13 @@ import copy
 
 import numpy as np
 from astropy.modeling import Fittable2DModel, Parameter
-from astropy.units import Quantity, Unit, UnitsError
+from astropy.units import (
+    Quantity,
+    Unit,
+    UnitsError,
+    dimensionless_unscaled,
+    pixel,
+)
 
 from photutils_mgauss import _compat
 
@@ -159,6 +165,22 @@ def strip_units(values):
         return values
     return [v.to_value(unit) if isinstance(v, Quantity) else v
             for v in values]
+
+
+def plain_positions(x, y, x_0, y_0):
+    """
+    Return points and the star's position without units.
+
+    A star's position without a unit is in pixels, and so must the points be.
+    """
+    if not isinstance(x_0, Quantity):
+        for name, value in (('x', x), ('y', y)):
+            unit = getattr(value, 'unit', None)
+            if unit not in (None, pixel, dimensionless_unscaled):
+                msg = (f'{name} must be in pixels, as x_0 has no unit, got '
+                       f'{unit}')
+                raise UnitsError(msg)
+    return strip_units([x, y, x_0, y_0])
 
 
 def split_flux(flux):

@@ -12,10 +12,13 @@ and the covariances follow from that same linear map. A common field of
 parallaxes (or accelerations) is treated alike.
 """
 from dataclasses import dataclass, replace
+from functools import partial, reduce
+from operator import add
 
 import numpy as np
 
-from photutils_mgauss._joint import eliminate, parts, run, scaled_rows
+from photutils_mgauss._joint import eliminate, parts, scaled_rows
+from photutils_mgauss._parallel import map_parallel
 from photutils_mgauss._stacked import gram
 
 
@@ -131,12 +134,11 @@ def remove_mean_field(problem, frames, estimates, family, weights, executor):
     """Return estimates without the mean field, and the field q (m,)."""
     def pieces(**others):
         return _pieces(problem, frames, family, weights, estimates, **others)
-    results = run(executor, _accumulate, pieces())
-    sums = sum(results[1:], results[0])
+    run = partial(map_parallel, executor=executor)
+    sums = reduce(add, run(_accumulate, pieces()))
     inverse = np.linalg.pinv(sums.normal, hermitian=True)
-    spread = sum(run(executor, _spread, pieces(sums=sums)))
-    moved = run(executor, _move, pieces(sums=sums, inverse=inverse,
-                                        spread=spread))
+    spread = sum(run(_spread, pieces(sums=sums)))
+    moved = run(_move, pieces(sums=sums, inverse=inverse, spread=spread))
     values, covariance = (np.concatenate(some, axis=-1)
                           for some in zip(*moved, strict=True))
     return (replace(estimates, values=values, covariance=covariance),

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from photutils_mgauss import plotting
+from photutils_mgauss._plot_style import BLACK
 from photutils_mgauss._psf_files import psf_kind, psf_record, read_psf
 from photutils_mgauss._report_page import Panel, Section
 from photutils_mgauss.shapes import adaptive_moments
@@ -101,7 +102,7 @@ def catalogue_section(path, table, record):
 def _chi2(ax, magnitude, chi2, label):
     plotting.plot_stated_errors(ax, magnitude, chi2, unit='', label=label)
     ax.set_ylabel('reduced chi2')
-    ax.axhline(1, color=plotting.BLACK, linewidth=0.8)
+    ax.axhline(1, color=BLACK, linewidth=0.8)
 
 
 def _plain(table, name):

@@ -4,7 +4,6 @@ From stars to pixels: light, charge and readout, in bands of rows.
 Each band has random numbers of its own, so that a seed gives the same pixels
 with any number of threads.
 """
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
@@ -19,7 +18,7 @@ from photutils_mgauss._detector_effects import (
     pattern,
     respond,
 )
-from photutils_mgauss._parallel import available_cores
+from photutils_mgauss._parallel import map_parallel
 from photutils_mgauss._simulation_brush import brush_of
 from photutils_mgauss._simulation_instrument import Instrument
 from photutils_mgauss._simulation_sky import Exposure
@@ -36,8 +35,9 @@ def draw(psf, x, y, flux, shape, faintest, executor):
     """Return the light (ny, nx) of stars."""
     bands, brush = row_bands(shape), brush_of(psf)
     image = np.empty(shape)
-    parts = _run(partial(_render, brush, shape[1], faintest), executor, bands,
-                 _split(brush, x, y, flux, bands, faintest))
+    parts = map_parallel(
+        partial(_render, brush, shape[1], faintest), bands,
+        _split(brush, x, y, flux, bands, faintest), executor=executor)
     for band, part in zip(bands, parts, strict=True):
         image[band] = part
     return image
@@ -48,15 +48,6 @@ def row_bands(shape):
     ny = shape[0]
     return [slice(start, min(start + _BAND_ROWS, ny))
             for start in range(0, ny, _BAND_ROWS)]
-
-
-def _run(function, executor, *columns):
-    """Map a function over columns of arguments, in threads by default."""
-    if executor is not None:
-        yield from executor.map(function, *columns)
-        return
-    with ThreadPoolExecutor(available_cores()) as pool:
-        yield from pool.map(function, *columns)
 
 
 def _split(brush, x, y, flux, bands, faintest):
@@ -116,8 +107,8 @@ def expose(chip, truth, psf, rng, executor):
     repel = chip.effects.brighter_fatter
     stars = _split(brush, x, y, 0 * flux if repel else flux, chip.bands,
                    FAINTEST)
-    parts = _run(partial(_expose_band, chip, brush), executor, chip.bands,
-                 stars, rng.spawn(len(chip.bands)))
+    parts = map_parallel(partial(_expose_band, chip, brush), chip.bands,
+                         stars, rng.spawn(len(chip.bands)), executor=executor)
     for band, part in zip(chip.bands, parts, strict=True):
         electrons[band], flags[band] = part
     if repel:
@@ -148,9 +139,9 @@ def read(chip, electrons, rng, executor):
     """Return the image that a pipeline makes of the electrons, and error."""
     image = np.empty(electrons.shape, np.float32)
     error = np.empty(electrons.shape, np.float32)
-    parts = _run(partial(_read_band, chip), executor, chip.bands,
-                 (electrons[band] for band in chip.bands),
-                 rng.spawn(len(chip.bands)))
+    parts = map_parallel(partial(_read_band, chip), chip.bands,
+                         (electrons[band] for band in chip.bands),
+                         rng.spawn(len(chip.bands)), executor=executor)
     for band, part in zip(chip.bands, parts, strict=True):
         image[band], error[band] = part
     return image, error

@@ -6,7 +6,7 @@ by Levenberg-Marquardt in compiled code; what photutils adds around that
 (tables, units, flags) is not here.
 """
 import itertools
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -14,7 +14,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._parallel import available_cores
+from photutils_mgauss._parallel import map_parallel
 from photutils_mgauss.gridded import GriddedMixturePSF
 from photutils_mgauss.model import MultiGaussianPSFModel
 
@@ -273,20 +273,5 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     chunks = list(stars.chunks())
     watch = partial(tqdm, desc='Fitting stars', total=len(chunks),
                     disable=not progress_bar)
-    if executor is not None:
-        return Fits.joined(_map_cancelling(executor, work, chunks, watch))
-    n_threads = min(len(chunks), available_cores())
-    if n_threads < 2:
-        return Fits.joined(list(watch(map(work, chunks))))
-    with ThreadPoolExecutor(n_threads) as pool:
-        return Fits.joined(_map_cancelling(pool, work, chunks, watch))
-
-
-def _map_cancelling(executor, function, arguments, watch):
-    """Map like an executor, but let nothing start after an exception."""
-    futures = [executor.submit(function, argument) for argument in arguments]
-    try:
-        return [future.result() for future in watch(futures)]
-    finally:
-        for future in futures:
-            future.cancel()
+    with closing(map_parallel(work, chunks, executor=executor)) as fits:
+        return Fits.joined(list(watch(fits)))

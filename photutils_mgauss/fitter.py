@@ -12,10 +12,12 @@ Photutils fits groups of stars without derivatives; here each star of a group
 contributes those of its own PSF.
 """
 import numpy as np
+from astropy.modeling.fitting import fitter_unit_support
 from scipy.linalg import cho_solve, cholesky
 
 from photutils_mgauss import _compat, _kernels
 from photutils_mgauss._psf_model import PSFModel
+from photutils_mgauss._validation import as_integer
 
 __all__ = ['MixtureFitter']
 
@@ -25,16 +27,10 @@ _MESSAGES = {
     3: 'The next step is expected to be below the tolerance.',
 }
 
+_MAX_STEPS = 100
+
 # Of the expected next step, see _State.length.
 _TOLERANCE = 1e-6
-
-# The least factor by which steps are taken to get shorter.
-_LEAST_RATE = 0.03
-
-# Out of steps, fits whose chi2 fell by a smaller fraction than this in the
-# last one count as good, as they do in scipy: along a valley, such as that of
-# two stars in one place, steps may remain long.
-_LEAST_FALL = 1e-8
 
 # Matrices scaled to a diagonal of one whose Cholesky factor has a smaller
 # square than this on its diagonal are taken for singular.
@@ -101,8 +97,8 @@ class MixtureFitter:
         weights : array_like, optional
             One over their standard deviations. Without, the covariance is
             scaled by the scatter of the residuals.
-        maxiter : int, optional
-            The largest number of steps.
+        maxiter : int or None, optional
+            The largest number of steps; None stands for 100.
         inplace : bool, optional
             Whether to change ``model`` itself.
 
@@ -114,9 +110,16 @@ class MixtureFitter:
         Raises
         ------
         ValueError
-            If nothing is free, a parameter is tied, or the arrays differ in
-            size or hold values that are not finite.
+            If nothing is free, a parameter is tied, ``maxiter`` is below 1,
+            or the arrays differ in size or hold values that are masked or
+            not finite.
         """
+        return self._fit_with_units(model, x, y, z=z, weights=weights,
+                                    maxiter=as_max_steps(maxiter, 'maxiter'),
+                                    inplace=inplace)
+
+    @fitter_unit_support
+    def _fit_with_units(self, model, x, y, z, *, weights, maxiter, inplace):
         problem = _Problem(model, x, y, z, weights)
         state, status, n_steps = _minimize(problem, maxiter)
         self.fit_info = {
@@ -125,6 +128,13 @@ class MixtureFitter:
         fitted = model if inplace else model.copy()
         fitted.parameters = problem.full(state.values)
         return fitted
+
+
+def as_max_steps(value, name):
+    """Return the largest number of steps, given it or None."""
+    if value is None:
+        return _MAX_STEPS
+    return as_integer(value, name, minimum=1)
 
 
 class _State:
@@ -167,9 +177,11 @@ class _Problem:
 
     def __init__(self, model, x, y, z, weights):
         self.base, self.n_sources = _compat.group_members(model)
-        self.x, self.y, self.z = (np.ravel(a).astype(float)
-                                  for a in (x, y, z))
-        self.weights = None if weights is None else np.ravel(weights)
+        self.x, self.y, self.z = (
+            _as_plain(a, name).astype(float)
+            for a, name in ((x, 'x'), (y, 'y'), (z, 'z')))
+        self.weights = None if weights is None else _as_plain(weights,
+                                                              'weights')
         self.start = np.array(model.parameters, dtype=float)
         names = model.param_names
         # Each access to these properties visits all parameters of a group.
@@ -244,6 +256,15 @@ class _Problem:
                              else state.chi2 / dof)
 
 
+def _as_plain(values, name):
+    """Return values flat; a mask that hides any is refused."""
+    if np.ma.is_masked(values):
+        msg = (f'{name} must not have masked values, got '
+               f'{np.ma.count_masked(values)}')
+        raise ValueError(msg)
+    return np.ravel(np.ma.getdata(values))
+
+
 def _inverse(matrix, scale):
     """Return the inverse, or the pseudo-inverse of a singular matrix."""
     outer = np.outer(scale, scale)
@@ -316,11 +337,11 @@ def _minimize(problem, max_steps):
         length = state.length(_undamped(problem, state, step, damping))
         gain, fall = _gain(state, new, step), state.chi2 - new.chi2
         state = new
-        if _remainder(length, last) < _TOLERANCE:
+        if _kernels._remainder(length, last) < _TOLERANCE:
             return state, 3, n + 2
         last, damping = length, _kernels._next_damping(
             damping, gain)
-    status = 2 if fall < _LEAST_FALL * state.chi2 else 0
+    status = 2 if fall < _kernels._LEAST_FALL * state.chi2 else 0
     return state, status, max_steps + 1
 
 
@@ -331,18 +352,6 @@ def _gain(state, new, step):
         return (state.chi2 - new.chi2) / expected
     # Of a smaller fall nothing is left after rounding: keep the damping.
     return _kernels._POOR_GAIN
-
-
-def _remainder(length, last):
-    """
-    Return how far the minimum is expected to be after a step.
-
-    Convergence is linear at the worst, each step shorter than the last one by
-    the same factor. A first step, with a last one of 0, says nothing of it,
-    and early steps make it look better than it will be.
-    """
-    rate = max(length / last, _LEAST_RATE) if last > 0 else 0.5
-    return length * (rate / (1 - rate) if rate < 0.9 else 10)
 
 
 def _undamped(problem, state, step, damping):

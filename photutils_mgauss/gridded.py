@@ -15,24 +15,28 @@ from collections.abc import Mapping
 
 import numpy as np
 from astropy.table import QTable
-from photutils.psf import GriddedPSFModel, ImagePSF
+from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss import _kernels
 from photutils_mgauss._files import storable, table_columns
-from photutils_mgauss._grid import checked_arrays, make_grid, split_seams
-from photutils_mgauss._nodes import NodeImages, fit_nodes, plain_report
+from photutils_mgauss._grid import checked_arrays, make_grid
+from photutils_mgauss._node_images import (
+    of_gridded_psf,
+    of_image_psf,
+    of_psfex,
+)
+from photutils_mgauss._nodes import fit_nodes, plain_report
 from photutils_mgauss._psf_model import (
     PARAMETER_COLUMNS,
     PSFModel,
     flat_points,
+    plain_positions,
     split_flux,
-    strip_units,
     with_unit,
 )
 from photutils_mgauss._validation import as_choice, as_floats, as_shape
 from photutils_mgauss.mixture import GaussianMixture
 from photutils_mgauss.model import MultiGaussianPSFModel
-from photutils_mgauss.psf_io import read_psfex
 
 __all__ = ['GriddedMixturePSF']
 
@@ -210,11 +214,7 @@ n_components=1)>
         if isinstance(psf, Mapping):
             return {name: cls.from_gridded_psf(one, n_components, **options)
                     for name, one in psf.items()}
-        oversampling = np.broadcast_to(psf.oversampling, 2).tolist()
-        nodes = NodeImages(np.asarray(psf.data, dtype=float),
-                           split_seams(np.array(psf.grid_xypos, float)),
-                           tuple(oversampling))
-        return cls._fitted(nodes, n_components, **options)
+        return cls._fitted(of_gridded_psf(psf), n_components, **options)
 
     @classmethod
     def from_psfex(cls, path, n_components=3, *, grid_shape=(30, 30),
@@ -255,13 +255,7 @@ n_components=1)>
         if isinstance(path, Mapping):
             return {name: cls.from_psfex(one, n_components, **options)
                     for name, one in path.items()}
-        model = path if hasattr(path, 'image_at') else read_psfex(path)
-        x, y = _psfex_lattice(model, as_shape(grid_shape, 'grid_shape'),
-                              limits)
-        images = [model.image_at(x_0, y_0, **(contexts or {}))
-                  for x_0, y_0 in zip(x, y, strict=True)]
-        nodes = NodeImages(np.array(images), np.column_stack([x, y]),
-                           origin=model.origin, unit=model.sampling)
+        nodes = of_psfex(path, grid_shape, limits=limits, contexts=contexts)
         return cls._fitted(nodes, n_components, scaled=False, **kwargs)
 
     @classmethod
@@ -297,18 +291,8 @@ n_components=1)>
             If the ePSFs differ in shape, origin or oversampling, or there is
             not one for each position.
         """
-        psfs = _image_psfs(psf)
-        if grid_xypos is None:
-            grid_xypos = np.zeros((1, 2))
-        grid_xypos = as_floats(grid_xypos, 'grid_xypos',
-                               shape=(len(psfs), 2))
-        positions, place = _full_lattice(grid_xypos)
-        images = np.zeros((len(positions), *psfs[0].data.shape))
-        images[place] = [one.data for one in psfs]
-        nodes = NodeImages(images, positions,
-                           tuple(psfs[0].oversampling.tolist()),
-                           tuple(psfs[0].origin.tolist()))
-        return cls._fitted(nodes, n_components, **kwargs)
+        return cls._fitted(of_image_psf(psf, grid_xypos), n_components,
+                           **kwargs)
 
     @classmethod
     def from_field(cls, field, *, grid_shape=(30, 30)):
@@ -434,7 +418,7 @@ n_components=1)>
         `~numpy.ndarray`
             The PSF, in the unit of ``flux``.
         """
-        x, y, x_0, y_0 = strip_units([x, y, x_0, y_0])
+        x, y, x_0, y_0 = plain_positions(x, y, x_0, y_0)
         flux, unit = split_flux(flux)
         if np.shape(x_0) != np.shape(y_0):
             x_0, y_0 = np.broadcast_arrays(x_0, y_0)
@@ -742,51 +726,6 @@ n_components=1)>
         stddevs = np.sqrt(grid.covariances[..., [0, 1], [0, 1]])
         reach = np.abs(grid.means) + self.bbox_factor * stddevs
         return reach.max(axis=(0, 1)) + 0.5 * self._pixel_integrated
-
-
-def _psfex_lattice(model, grid_shape, limits):
-    """Return the positions x, y (M,) of the nodes for a PSFEx model."""
-    axes = []
-    limits = model.position_range if limits is None else limits
-    for n, limit, dependence in zip(grid_shape[::-1], limits,
-                                    model.position_range, strict=True):
-        if dependence is None:
-            axes.append(np.array([0.0 if limit is None else limit[0]]))
-        else:
-            axes.append(np.linspace(*limit, n) if n > 1
-                        else np.array([np.mean(limit)]))
-    x, y = np.meshgrid(*axes)
-    return x.ravel(), y.ravel()
-
-
-def _image_psfs(psf):
-    """Return a list of ImagePSF models that are alike."""
-    several = isinstance(psf, (list, tuple)) and not hasattr(psf, 'epsf')
-    psfs = [getattr(one, 'epsf', one) for one in (psf if several else [psf])]
-    for one in psfs:
-        if not isinstance(one, ImagePSF):
-            msg = f'psf must be made of ImagePSF models, got {one!r:.80}'
-            raise TypeError(msg)
-        pairs = [(getattr(one, name), getattr(psfs[0], name))
-                 for name in ('origin', 'oversampling')]
-        pairs.append((one.data.shape, psfs[0].data.shape))
-        if not all(np.array_equal(*pair) for pair in pairs):
-            msg = ('psf must have ePSFs of one shape, origin and '
-                   'oversampling, got different ones')
-            raise ValueError(msg)
-    return psfs
-
-
-def _full_lattice(grid_xypos):
-    """Return all nodes of the rectangular grid, and which ones are given."""
-    x, i = np.unique(grid_xypos[:, 0], return_inverse=True)
-    y, j = np.unique(grid_xypos[:, 1], return_inverse=True)
-    place = j * x.size + i
-    if np.unique(place).size != place.size:
-        msg = 'grid_xypos must not have two nodes at one place'
-        raise ValueError(msg)
-    nodes = np.stack(np.meshgrid(x, y), axis=-1)
-    return nodes.reshape(-1, 2), place
 
 
 def _galsim_gaussian(weight, mean, covariance, scale, galsim):

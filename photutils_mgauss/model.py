@@ -17,6 +17,7 @@ from photutils_mgauss._psf_model import (
     PSFModel,
     PSFParameter,
     flat_points,
+    plain_positions,
     split_flux,
     strip_units,
     with_unit,
@@ -220,7 +221,7 @@ class MultiGaussianPSFModel(PSFModel):
             The model, in the unit of ``flux``.
         """
         rows = _rows_of(strip_units([x, *shape])[1:])
-        x, y, x_0, y_0 = strip_units([x, y, x_0, y_0])
+        x, y, x_0, y_0 = plain_positions(x, y, x_0, y_0)
         flux, unit = split_flux(flux)
         dx = np.subtract(x, x_0, dtype=float)
         dy = np.subtract(y, y_0, dtype=float)

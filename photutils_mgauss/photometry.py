@@ -23,7 +23,7 @@ from photutils_mgauss import _compat, _star_fits
 from photutils_mgauss import _photometry_table as _table
 from photutils_mgauss._photometry_result import FitInfo, FitResult
 from photutils_mgauss._validation import as_choice, as_real
-from photutils_mgauss.fitter import MixtureFitter
+from photutils_mgauss.fitter import MixtureFitter, as_max_steps
 
 __all__ = ['MixturePSFPhotometry']
 
@@ -91,8 +91,8 @@ class MixturePSFPhotometry(PSFPhotometry):
     ------
     ValueError
         In the call: as photutils does, for arrays of different shapes,
-        errors that are not positive under a star, or ids that are not
-        unique.
+        errors that are not positive under a star, ids that are not unique,
+        or a ``fitter_maxiters`` below 1.
 
     Examples
     --------
@@ -240,7 +240,8 @@ class MixturePSFPhotometry(PSFPhotometry):
         fits = _star_fits.fit_stars(
             image, _star_fits.psf_arrays(self.psf_model), stars,
             fit_sky=self.fit_sky, executor=self.executor,
-            max_iterations=self.fitter_maxiters or 100,
+            max_iterations=as_max_steps(self.fitter_maxiters,
+                                        'fitter_maxiters'),
             progress_bar=self.progress_bar)
         _check_errors(fits, stars)
         return start.result(rows, fits), counts[inverse]

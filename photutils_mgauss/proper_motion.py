@@ -12,7 +12,12 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from photutils_mgauss._assemble import assemble, check_epochs, tie_planes
+from photutils_mgauss._assemble import (
+    assemble,
+    check_epochs,
+    few_in_common,
+    tie_planes,
+)
 from photutils_mgauss._bootstrap import bootstrap_frames, bootstrap_median
 from photutils_mgauss._corrected_wcs import Correction, correct_epoch
 from photutils_mgauss._epoch import Epoch
@@ -108,7 +113,8 @@ class MotionSolution:
         the references used and rejected, the rms of their residuals, and
         the systematic error found.
     notes : tuple of str
-        What the data could not determine, in sentences.
+        What the data could not determine, and which epochs have few stars
+        in common with the others, in sentences.
 
     Examples
     --------
@@ -481,9 +487,11 @@ class ProperMotionFitter:
         if self.ref_epoch is not None:
             year = float(julian_years(self.ref_epoch, 'ref_epoch'))
         corrected, residuals = _corrected(epochs, result)
+        notes = (*result.frames.undetermined,
+                 *few_in_common(result.scene.sightings))
         return MotionSolution(star_table(result, year), corrected,
-                              alignment_table(result, residuals),
-                              result.frames.undetermined, result)
+                              alignment_table(result, residuals), notes,
+                              result)
 
     def _match(self):
         as_choice(self.match_by, 'match_by', ('auto', 'id', 'sky'))

@@ -1,10 +1,9 @@
 """A field from the stars of a real survey chip, beside PSFEx's model."""
 import numpy as np
 import pytest
-from astropy.io import fits
-from astropy.table import QTable, Table
+from astropy.table import QTable
+from decam_chip import decam_chip, fit_spline, psfex_spline
 from photutils.psf import PSFPhotometry
-from scipy.interpolate import RectBivariateSpline
 
 from photutils_mgauss import (
     MixturePSFPhotometry,
@@ -12,50 +11,14 @@ from photutils_mgauss import (
     read_psfex,
 )
 
-CATALOGUE = 'DECam_00241238_01_psfcat_tb_maxmag_17.0_magcut_3.0_findstars.fits'
 PSFEX = 'DECam_00241238_01_psfex_samp0.5_deg2.psf'
 SIZE = 25
 
 
 @pytest.fixture
 def chip(realdata):
-    """Paste the vignettes of 117 stars into an empty chip."""
-    rows = fits.getdata(realdata('decam_psfex') / CATALOGUE, 2)
-    data = np.full((4096, 2048), np.nan)
-    x, y = rows['X_IMAGE'] - 1.0, rows['Y_IMAGE'] - 1.0
-    for vignette, x_0, y_0 in zip(rows['VIGNET'], x, y, strict=True):
-        left, bottom = int(np.rint(x_0)) - 31, int(np.rint(y_0)) - 31
-        y_in, x_in = np.mgrid[bottom:bottom + 63, left:left + 63]
-        inside = ((x_in >= 0) & (y_in >= 0) & (x_in < 2048) & (y_in < 4096)
-                  & (vignette > -1e29))
-        data[y_in[inside], x_in[inside]] = vignette[inside]
-    # Sky noise 9 ADU, 3.9 electrons per ADU.
-    error = np.sqrt(81 + np.maximum(np.nan_to_num(data), 0) / 3.9)
-    return data, error, Table({'x': x, 'y': y})
-
-
-def psfex_chi2(model, data, error, x, y):
-    """Fit x, y and flux of PSFEx's model; return the reduced chi^2."""
-    image = model.image_at(x, y)
-    steps = [(np.arange(n) - origin) * model.sampling for n, origin in
-             zip(image.shape[::-1], model.origin, strict=True)]
-    spline = RectBivariateSpline(steps[1], steps[0], image)
-    left, bottom = int(np.rint(x)) - SIZE // 2, int(np.rint(y)) - SIZE // 2
-    cut = np.s_[bottom:bottom + SIZE, left:left + SIZE]
-    y_in, x_in = np.mgrid[cut]
-    good = np.isfinite(data[cut])
-    pixels, sigma = data[cut][good], error[cut][good]
-    place = np.array([x, y])
-    for _ in range(6):
-        offset = y_in[good] - place[1], x_in[good] - place[0]
-        profile, by_y, by_x = (spline.ev(*offset, dx=dx, dy=dy) for dx, dy
-                               in ((0, 0), (1, 0), (0, 1)))
-        flux = (profile / sigma**2) @ pixels / np.sum((profile / sigma)**2)
-        slopes = np.column_stack([profile, -flux * by_x, -flux * by_y])
-        residual = (pixels - flux * profile) / sigma
-        step = np.linalg.lstsq(slopes / sigma[:, None], residual)[0]
-        place += step[1:]
-    return np.sum((residual - slopes @ step / sigma) ** 2) / (good.sum() - 3)
+    """Return a chip with nothing but 117 stars."""
+    return decam_chip(realdata('decam_psfex'))
 
 
 def test_left_out_stars_are_described_as_well_as_by_psfex(chip, realdata):
@@ -68,7 +31,7 @@ def test_left_out_stars_are_described_as_well_as_by_psfex(chip, realdata):
     result = MixturePSFPhotometry(psf, SIZE, aperture_radius=6)(
         data, mask=~np.isfinite(data), error=error, init_params=start)
     model = read_psfex(realdata('decam_psfex') / PSFEX)
-    theirs = [psfex_chi2(model, data, error, x, y)
+    theirs = [fit_spline(psfex_spline(model, x, y), data, error, x, y)[2]
               for x, y in stars[out].iterrows()]
     whole = np.asarray(result['n_pixels_fit']) == SIZE**2
     # PSFEx has seen these stars, the field has not.

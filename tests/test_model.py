@@ -16,7 +16,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import GaussianPSF
 from strategies import SETTINGS, mixtures, numbers
 
-from photutils_mgauss import GaussianMixture, MultiGaussianPSFModel
+from photutils_mgauss import (
+    GaussianMixture,
+    GriddedMixturePSF,
+    MultiGaussianPSFModel,
+)
 
 Y, X = np.mgrid[:21, :23]
 
@@ -186,6 +190,15 @@ def test_positions_may_carry_units(model):
     fitted = TRFLSQFitter()(start, x, y, image)
     assert fitted.x_0.unit == u.pix
     assert_allclose(fitted.x_0.value, 11.2)
+
+
+@pytest.mark.parametrize('grid', [False, True])
+def test_points_on_the_sky_are_not_pixels(model, grid):
+    if grid:
+        model = GriddedMixturePSF([model.mixture], [(0, 0)])
+    assert model(3 * u.pix, 2 * u.pix) == model(3, 2)
+    with pytest.raises(u.UnitsError, match=r'y must be in pixels.*got deg'):
+        model(3, 2 * u.deg)
 
 
 def test_flux_may_be_a_quantity(model):

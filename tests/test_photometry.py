@@ -2,10 +2,14 @@
 import warnings
 from functools import partial
 
+import astropy
 import numpy as np
 import pytest
+from astropy import units as u
+from astropy.modeling.fitting import TRFLSQFitter
 from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import QTable
+from astropy.utils import minversion
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import PSFPhotometry, SourceGrouper
 
@@ -18,6 +22,11 @@ from photutils_mgauss import (
 )
 
 SHAPE = (140, 150)
+# For groups photutils has no derivatives. Before 7.2.3 and 8.0.2 astropy took
+# differences over 1e-4 of a position then, the root of the step meant, and
+# stopped that much beside the minimum.
+COARSE_STEPS = not minversion(astropy, '7.2.3') or (
+    minversion(astropy, '8.0.0') and not minversion(astropy, '8.0.2'))
 
 
 def mixture(f):
@@ -72,8 +81,9 @@ def both(psf, data, shape=(9, 9), call=None, **kwargs):
     return tables
 
 
-def check_same(theirs, ours):
+def check_same(theirs, ours, *, grouped=False):
     """Check that two tables agree as promised."""
+    tolerance = 3e-4 if grouped and COARSE_STEPS else 1e-5
     assert ours.colnames == theirs.colnames
     assert type(ours) is type(theirs)
     for name in ours.colnames:
@@ -83,8 +93,8 @@ def check_same(theirs, ours):
     ours, theirs = ({name: getattr(table[name], 'value', table[name])
                      for name in table.colnames} for table in (ours, theirs))
     for name in ('x_fit', 'y_fit'):
-        assert_allclose(ours[name], theirs[name], rtol=0, atol=1e-5)
-    assert_allclose(ours['flux_fit'], theirs['flux_fit'], rtol=1e-5)
+        assert_allclose(ours[name], theirs[name], rtol=0, atol=tolerance)
+    assert_allclose(ours['flux_fit'], theirs['flux_fit'], rtol=tolerance)
     for name in ('x_err', 'y_err', 'flux_err', 'reduced_chi2'):
         assert_allclose(ours[name], theirs[name], rtol=0.01)
     for name in ('qfit', 'cfit'):
@@ -130,7 +140,7 @@ def test_grouped_stars_come_out_as_from_photutils(grid, rng):
     call = {'error': error, 'init_params': guess(x, y, flux, rng)}
     theirs, ours = both(grid, data, call=call, grouper=SourceGrouper(6))
     assert set(ours['group_size']) == {1, 2, 3}
-    check_same(theirs, ours)
+    check_same(theirs, ours, grouped=True)
 
 
 def test_masked_and_edge_stars_come_out_as_from_photutils(grid, rng):
@@ -181,7 +191,6 @@ def test_quantities_and_nddata_give_units(grid, rng):
                                           init_params=start)
     start['flux'] = start['flux'] * 1.0
     nddata = NDData(data, uncertainty=StdDevUncertainty(error), unit='nJy')
-    from astropy import units as u
     start['flux'] = start['flux'] << u.nJy
     theirs, ours = both(grid, nddata, call={'init_params': start})
     check_same(theirs, ours)
@@ -362,7 +371,7 @@ def test_the_fitter_serves_photutils_in_groups(grid, rng):
     theirs = PSFPhotometry(grid, (9, 9), **kwargs)(data, **call)
     ours = PSFPhotometry(grid, (9, 9), fitter=MixtureFitter(),
                          **kwargs)(data, **call)
-    check_same(theirs, ours)
+    check_same(theirs, ours, grouped=True)
 
 
 @pytest.mark.parametrize('photometry', [
@@ -401,6 +410,31 @@ def test_the_fitter_does_not_mind_the_unit_of_flux_or_the_origin(
     assert_allclose(found, [found[0]] * 4, rtol=0, atol=1e-8)
     step = np.array(found[0]) - [1, 5.3, 4.8]
     assert (abs(step) < [0.03, 0.03, 0.03]).all()
+
+
+def test_the_fitter_takes_units_as_fitters_of_astropy_do():
+    y, x = np.mgrid[:11, :11]
+    model = MultiGaussianPSFModel(mixture(0.3), flux=0.8 * u.nJy,
+                                  x_0=5 * u.pix, y_0=5 * u.pix)
+    data = mixture(0.3).render(11, 5.3, 4.8) * u.nJy
+    call = model, x * u.pix, y * u.pix, data
+    ours, theirs = (fitter(*call) for fitter in (MixtureFitter(),
+                                                 TRFLSQFitter()))
+    for name in ('flux', 'x_0', 'y_0'):
+        got, want = (getattr(fit, name).quantity for fit in (ours, theirs))
+        assert got.unit == want.unit
+        assert_allclose(got.value, want.value, atol=1e-6)
+
+
+def test_the_fitter_refuses_masked_pixels_and_takes_an_empty_mask():
+    y, x = np.mgrid[:11, :11]
+    data = np.ma.array(mixture(0.3).render(11, 5.3, 4.8), mask=False)
+    model = MultiGaussianPSFModel(mixture(0.3), x_0=5, y_0=5)
+    assert_allclose(MixtureFitter()(model, x, y, data).x_0, 5.3, atol=1e-6)
+    data[3, 3] = np.ma.masked
+    with pytest.raises(ValueError, match='z must not have masked values, '
+                                         'got 1'):
+        MixtureFitter()(model, x, y, data)
 
 
 def test_any_executor_gives_the_same_table(grid, rng):

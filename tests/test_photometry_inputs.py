@@ -5,13 +5,14 @@ import warnings
 
 import numpy as np
 import pytest
-from astropy.table import QTable
+from astropy.table import QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import PSFPhotometry
 
 from photutils_mgauss import (
     GaussianMixture,
     MixtureField,
+    MixtureFitter,
     MixturePSFPhotometry,
     MultiGaussianPSFModel,
 )
@@ -131,6 +132,44 @@ def test_a_field_is_taken_as_its_grid(rng):
         for psf in (field, field.to_grid()))
     for name in by_grid.colnames:
         assert_array_equal(by_field[name], by_grid[name], name)
+
+
+@pytest.mark.parametrize('name', ['x', 'flux'])
+def test_a_masked_start_is_none_whatever_lies_under_the_mask(rng, name):
+    x, y = lattice(rng)
+    data, error = observe(x, y, np.full(x.size, 2e4), rng)
+    start = Table({'x': x, 'y': y, 'flux': np.full(x.size, 2e4)}, masked=True)
+    start[name].mask[3] = True
+    theirs, ours = (quiet(cls(PSF, 9), data, error=error, init_params=start)
+                    for cls in (PSFPhotometry, MixturePSFPhotometry))
+    assert_array_equal(ours['flags'], theirs['flags'])
+    assert np.isnan(ours['flux_fit'][3])
+    assert_allclose(ours['flux_fit'], theirs['flux_fit'], rtol=1e-5)
+
+
+def test_a_masked_background_is_not_subtracted(rng):
+    x, y = lattice(rng)
+    data, error = observe(x, y, np.full(x.size, 2e4), rng)
+    start = Table({'x': x, 'y': y, 'flux': np.full(x.size, 2e4),
+                   'local_bkg': np.ma.array(np.full(x.size, 99.0), mask=True)})
+    got = MixturePSFPhotometry(PSF, 9)(data, error=error, init_params=start)
+    start.remove_column('local_bkg')
+    want = MixturePSFPhotometry(PSF, 9)(data, error=error, init_params=start)
+    assert_array_equal(got['flux_fit'], want['flux_fit'])
+
+
+@pytest.mark.parametrize(('steps', 'kind'), [
+    (0, ValueError), (-1, ValueError), (1.5, TypeError), ('a', TypeError)])
+def test_a_number_of_steps_that_is_none_is_refused(rng, steps, kind):
+    data, _ = observe([20.0], [20.0], [2e4], rng)
+    start = QTable({'x': [20.0], 'y': [20.0], 'flux': [2e4]})
+    # Some versions of photutils refuse it themselves.
+    with pytest.raises((ValueError, TypeError), match='maxiters must be'):
+        MixturePSFPhotometry(PSF, 9, fitter_maxiters=steps)(
+            data, init_params=start)
+    with pytest.raises(kind, match=f'maxiter must be .*{steps}'):
+        MixtureFitter()(PSF, [0, 1, 2, 3], [0, 1, 1, 0], [1, 1, 1, 1],
+                        maxiter=steps)
 
 
 def test_a_progress_bar_is_shown_if_asked_for(rng, capsys):

@@ -4,6 +4,9 @@ How good a grid is.
 ePSFs with Airy rings, over a detector, turned into mixtures of three
 Gaussians: the error of the size at each node (as Figs. 4 to 7 of Nie et al.),
 the pixel-phase error, and the ellipticity as whiskers along the long axis.
+Below, for two, three and five Gaussians, what is left of the ePSF that is
+described worst: a pattern that one Gaussian could take up asks for more of
+them.
 """
 import matplotlib.pyplot as plt
 import numpy as np
@@ -13,7 +16,11 @@ from photutils.psf import GriddedPSFModel
 from scipy.ndimage import convolve1d
 
 from photutils_mgauss import GriddedMixturePSF
-from photutils_mgauss.plotting import plot_node_map, plot_whiskers
+from photutils_mgauss.plotting import (
+    plot_node_map,
+    plot_whiskers,
+    plot_worst_node,
+)
 
 
 def airy(x_0, y_0):
@@ -31,12 +38,17 @@ places = [(x, y) for y in lines for x in lines]
 epsfs = GriddedPSFModel(NDData(
     np.array([airy(*place) for place in places]),
     meta={'grid_xypos': places, 'oversampling': 3}))
-psf = GriddedMixturePSF.from_gridded_psf(epsfs, n_components=3)
+psfs = {k: GriddedMixturePSF.from_gridded_psf(epsfs, n_components=k)
+        for k in (2, 3, 5)}
 
-figure, axes = plt.subplots(1, 3, figsize=(13, 3.6), layout='constrained')
-plot_node_map(axes[0], psf, 'size_error')
-plot_node_map(axes[1], psf, 'phase_error')
-plot_whiskers(axes[2], psf)
-axes[2].set_title('ellipticity')
-for ax in axes:
+figure, axes = plt.subplots(2, 3, figsize=(13, 7.4), layout='constrained')
+maps, worst = axes
+plot_node_map(maps[0], psfs[3], 'size_error')
+plot_node_map(maps[1], psfs[3], 'phase_error')
+plot_whiskers(maps[2], psfs[3])
+maps[2].set_title('ellipticity')
+for ax in maps:
     ax.set_title(ax.get_title().replace(': ', '\n'), fontsize='medium')
+for ax, (k, psf) in zip(worst, psfs.items(), strict=True):
+    plot_worst_node(ax, psf, epsfs)
+    ax.set_title(f'K = {k}\n{ax.get_title()}', fontsize='medium')

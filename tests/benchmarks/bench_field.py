@@ -28,6 +28,7 @@ import sys
 import tempfile
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,14 @@ from photutils_mgauss import (
     assess_psf,
     fit_mixture_field,
     select_psf_stars,
+)
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from decam_chip import (
+    decam_chip,
+    find_catalogue,
+    fit_spline,
+    psfex_spline,
 )
 
 EDGES = np.arange(18, 27)
@@ -332,24 +341,6 @@ def many_stars(truth_psf, n, size, sky, rng):
     return rng.normal(clean, np.sqrt(variance)), np.sqrt(variance), stars
 
 
-def decam_stars(folder):
-    """Return the catalogue's file and rows, image, error and star table."""
-    from astropy.io import fits
-    file = next(Path(folder).glob('*findstars.fits'))
-    rows = fits.getdata(file, 2)
-    x, y = rows['X_IMAGE'] - 1.0, rows['Y_IMAGE'] - 1.0
-    data = np.full((4096, 2048), np.nan)
-    for vignette, x_0, y_0 in zip(rows['VIGNET'], x, y, strict=True):
-        left, bottom = int(np.rint(x_0)) - 31, int(np.rint(y_0)) - 31
-        y_in, x_in = np.mgrid[bottom:bottom + 63, left:left + 63]
-        inside = ((x_in >= 0) & (y_in >= 0) & (x_in < 2048) & (y_in < 4096)
-                  & (vignette > -1e29))
-        data[y_in[inside], x_in[inside]] = vignette[inside]
-    # Sky noise 9 ADU, 3.9 electrons per ADU.
-    error = np.sqrt(81 + np.maximum(np.nan_to_num(data), 0) / 3.9)
-    return file, data, error, Table({'x': x, 'y': y})
-
-
 def psfex_of(file, keep):
     """Return psfex's model of some rows of an LDAC catalogue."""
     from astropy.io import fits
@@ -368,54 +359,21 @@ def psfex_of(file, keep):
         return read_psfex(some.with_suffix('.psf'))
 
 
-def fit_spline(spline, data, error, x, y, half=None):
-    """
-    Return position and reduced chi^2 of a star within 12 pixels.
-
-    half is 0 or 1 for every other pixel, as on a chessboard.
-    """
-    cut = np.s_[int(np.rint(y)) - 12:int(np.rint(y)) + 13,
-                int(np.rint(x)) - 12:int(np.rint(x)) + 13]
-    y_in, x_in = np.mgrid[cut]
-    good = np.isfinite(data[cut])
-    if half is not None:
-        good &= (x_in + y_in) % 2 == half
-    pixels, sigma = data[cut][good], error[cut][good]
-    place = np.array([x, y])
-    for _ in range(8):
-        offset = y_in[good] - place[1], x_in[good] - place[0]
-        profile, by_y, by_x = (spline.ev(*offset, dx=dx, dy=dy) for dx, dy
-                               in ((0, 0), (1, 0), (0, 1)))
-        flux = (profile / sigma**2) @ pixels / np.sum((profile / sigma)**2)
-        slopes = np.column_stack([profile, -flux * by_x, -flux * by_y])
-        residual = (pixels - flux * profile) / sigma
-        step = np.linalg.lstsq(slopes / sigma[:, None], residual)[0]
-        place += np.clip(step[1:], -1, 1)
-    chi2 = np.sum((residual - slopes @ step / sigma)**2) / (good.sum() - 3)
-    return np.append(place, chi2)
-
-
 def print_decam(folder):
     """Fit left-out stars of a DECam chip with both PSFs."""
     from scipy.interpolate import RectBivariateSpline
-    file, data, error, stars = decam_stars(folder)
+    data, error, stars = decam_chip(folder)
     near = np.minimum(stars['x'], stars['y']) > 14
     near &= (stars['x'] < 2048 - 15) & (stars['y'] < 4096 - 15)
     out = np.arange(len(stars)) % 4 == 0
     field = fit_mixture_field(data, stars[~out], error=error, degree=2,
                               n_components=5, radius=12)
-    theirs = psfex_of(file, ~out)
+    psfex = partial(psfex_spline, psfex_of(find_catalogue(folder), ~out))
     lattice = np.arange(-36, 37) / 2
 
     def mine(x, y):
         image = field.mixture_at(x, y).evaluate(lattice, lattice[:, None])
         return RectBivariateSpline(lattice, lattice, image)
-
-    def psfex(x, y):
-        image = theirs.image_at(x, y)
-        steps = [(np.arange(n) - origin) * theirs.sampling for n, origin in
-                 zip(image.shape[::-1], theirs.origin, strict=True)]
-        return RectBivariateSpline(steps[1], steps[0], image)
 
     print(f'{field}; {np.sum(out & near)} stars left out')
     results = {}

@@ -1,0 +1,292 @@
+"""Figures of a PSF over a detector, on the Axes they are given."""
+import numpy as np
+from astropy.stats import mad_std
+
+from photutils_mgauss._plot_style import BLACK, BLUE, ORANGE
+from photutils_mgauss.shapes import adaptive_moments
+
+__all__ = [
+    'plot_node_map',
+    'plot_psf_image',
+    'plot_shape_map',
+    'plot_whiskers',
+    'plot_width_map',
+    'plot_worst_node',
+]
+
+_NODE_LABELS = {
+    'size_error': r'$\delta(R^2)/R^2$',
+    'ellipticity_error': r'$\delta\epsilon$',
+    'phase_error': 'pixel-phase error [pix]',
+    'enclosed_flux': 'enclosed flux',
+}
+
+
+def plot_node_map(ax, psf, column='size_error', *, layout=None):
+    r"""
+    Map a column of the nodes' report (as Figs. 4-7 of Nie et al.).
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Where to draw.
+    psf : GriddedMixturePSF or a dict of them
+        One detector, or several by name.
+    column : str, optional
+        A numeric column of ``report``, such as ``'size_error'``,
+        :math:`\delta(R^2)/R^2`, or ``'ellipticity_error'``,
+        :math:`\delta\epsilon`.
+    layout : dict of (x, y), optional
+        Where the pixel (0, 0) of each detector is in the focal plane [pix];
+        by default the detectors stand side by side.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        The same; its title tells median and scatter (1.4826 MAD) of the
+        nodes that are not bridged.
+
+    Raises
+    ------
+    ValueError
+        If ``layout`` has no place for a detector.
+    """
+    psfs, places = _laid_out(psf, layout)
+    reports = {name: one.report for name, one in psfs.items()}
+    values = np.concatenate([np.where(report['bridged'], np.nan,
+                                      report[column])
+                             for report in reports.values()])
+    good = values[np.isfinite(values)]
+    limits = np.percentile(good, [2, 98]) if good.size else (0, 1)
+    x, y = np.concatenate([
+        [report['x'] + places[name][0], report['y'] + places[name][1]]
+        for name, report in reports.items()], axis=1)
+    points = ax.scatter(x, y, c=values, s=9, marker='s', cmap='cividis',
+                        vmin=limits[0], vmax=limits[1], plotnonfinite=False)
+    label = _NODE_LABELS.get(column, column)
+    ax.figure.colorbar(points, ax=ax, label=label)
+    if good.size:
+        ax.set_title(f'{label}: median {np.median(good):.2g}, '
+                     f'scatter {mad_std(good):.2g}')
+    return _focal_plane(ax, psfs, places)
+
+
+def plot_whiskers(ax, psf, *, layout=None, scale=None):
+    """
+    Plot the ellipticity of the nodes as whiskers along the long axis.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Where to draw.
+    psf : GriddedMixturePSF or a dict of them
+        One detector, or several by name.
+    layout : dict of (x, y), optional
+        As in `plot_node_map`.
+    scale : float, optional
+        The length of a whisker of ellipticity 1 [pix]; by default the largest
+        whisker is as long as half the distance of two nodes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        The same.
+    """
+    psfs, places = _laid_out(psf, layout)
+    segments = []
+    for name, one in psfs.items():
+        shapes = adaptive_moments(one.mixtures)
+        angle = 0.5 * np.arctan2(shapes.e2, shapes.e1)
+        half = 0.5 * shapes.ellipticity[:, None] * np.column_stack(
+            [np.cos(angle), np.sin(angle)])
+        middle = one.grid_xypos + places[name]
+        segments.append((middle, half))
+    middle, half = (np.concatenate(part) for part in zip(*segments,
+                                                         strict=True))
+    if scale is None:
+        scale = 0.25 * _node_distance(psfs) / max(np.hypot(*half.T).max(),
+                                                  1e-12)
+    ends = np.stack([middle - scale * half, middle + scale * half])
+    ax.plot(*np.moveaxis(ends, -1, 0), color=BLUE, linewidth=1)
+    return _focal_plane(ax, psfs, places)
+
+
+def plot_worst_node(ax, psf, source, column='size_error'):
+    """
+    Show the residual of the node with the largest error.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Where to draw.
+    psf : GriddedMixturePSF
+        The grid of mixtures.
+    source : `~photutils.psf.GriddedPSFModel`
+        The ePSFs it was made of.
+    column : str, optional
+        The column of ``report`` that is the error.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        The same, with ePSF minus mixture in per cent of the ePSF's peak.
+    """
+    report = psf.report
+    error = np.where(report['bridged'], 0, np.abs(report[column]))
+    worst = int(np.nanargmax(error))
+    distance = np.hypot(*(np.array(source.grid_xypos, float)
+                          - psf.grid_xypos[worst]).T)
+    image = np.asarray(source.data[distance.argmin()], float)
+    oversampling = np.broadcast_to(source.oversampling, 2)
+    y, x = ((np.arange(n) - (n - 1) / 2) / step
+            for n, step in zip(image.shape, oversampling, strict=True))
+    model = psf.scales[worst] * psf.mixtures[worst].evaluate(x, y[:, None])
+    residual = 100 * (image - model) / image.max()
+    limit = np.abs(residual[2:-2, 2:-2]).max()
+    picture = ax.imshow(residual, origin='lower', cmap='RdBu_r', vmin=-limit,
+                        vmax=limit, extent=(x[0], x[-1], y[0], y[-1]))
+    ax.figure.colorbar(picture, ax=ax, label='residual [% of the peak]')
+    place = psf.grid_xypos[worst]
+    ax.set(xlabel='x [pix]', ylabel='y [pix]', title=(
+        f'node ({place[0]:.0f}, {place[1]:.0f}), '
+        f'{_NODE_LABELS.get(column, column)} = {report[column][worst]:.2g}'))
+    return ax
+
+
+def plot_width_map(ax, psf, *, stars=None):
+    r"""
+    Map the width of the nodes' PSFs, :math:`2.35 \sqrt{R^2 / 2}`.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Where to draw.
+    psf : GriddedMixturePSF
+        The PSF.
+    stars : (n, 2) array_like, optional
+        Positions of the stars it was made of, to be marked [pix].
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        The same.
+    """
+    fwhm = 2.3548 * np.sqrt(adaptive_moments(psf.mixtures).r2 / 2)
+    x, y = psf.grid_xypos.T
+    points = ax.scatter(x, y, c=fwhm, s=12, marker='s', cmap='cividis')
+    ax.figure.colorbar(points, ax=ax, label='FWHM [pix]')
+    if stars is not None and len(stars):
+        ax.plot(*np.transpose(stars), 'o', color=ORANGE, fillstyle='none',
+                markersize=6)
+    ax.set_title(f'FWHM: median {np.median(fwhm):.3f}, '
+                 f'range {np.ptp(fwhm):.2g} pix')
+    return _focal_plane(ax, {'': psf}, {'': (0, 0)})
+
+
+def plot_psf_image(ax, psf, x, y, *, radius=8, decades=4):
+    """
+    Show the PSF at a place, in logarithms.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Where to draw.
+    psf : GriddedMixturePSF
+        The PSF.
+    x, y : float
+        The place on the detector [pix].
+    radius : float, optional
+        Half the width of the image [pix].
+    decades : float, optional
+        How many powers of ten below the peak are shown.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        The same.
+    """
+    points = np.linspace(-radius, radius, 161)
+    image = psf.mixture_at(x, y).evaluate(
+        points, points[:, None], pixel_integrated=psf.pixel_integrated)
+    peak = image.max()
+    shown = ax.imshow(
+        np.log10(np.maximum(image / peak, 10.0 ** -decades)), origin='lower',
+        cmap='cividis', extent=(-radius, radius, -radius, radius))
+    ax.figure.colorbar(shown, ax=ax, label='log of value / peak')
+    ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal',
+           title=f'the PSF at ({x:.0f}, {y:.0f})')
+    return ax
+
+
+def plot_shape_map(ax, x, y, values, *, label):
+    """
+    Show a quantity at points of the detector, its mean and scatter on top.
+
+    As Figs. 4 to 7, for the deviations that
+    `~photutils_mgauss.Shapes.relative_size_error` and
+    `~photutils_mgauss.Shapes.ellipticity_error` return.
+
+    Parameters
+    ----------
+    ax : `~matplotlib.axes.Axes`
+        Where to draw.
+    x, y : (n,) array_like
+        Positions on the detector [pix].
+    values : (n,) array_like
+        The deviations; NaN is left out.
+    label : str
+        What they are.
+
+    Returns
+    -------
+    `~matplotlib.collections.PathCollection`
+        To make a colour bar from.
+    """
+    values = np.asarray(values, float)
+    limit = np.nanmax(np.abs(values))
+    shown = ax.scatter(x, y, c=values, cmap='RdBu_r', vmin=-limit, vmax=limit,
+                       marker='s')
+    ax.set(aspect='equal', xlabel='x [pix]', ylabel='y [pix]')
+    ax.set_title(f'{label}: {np.nanmean(values):+.2e} '
+                 f'$\\pm$ {np.nanstd(values):.1e}')
+    return shown
+
+
+def _laid_out(psf, layout):
+    """Return dicts of grids and of their places in the focal plane."""
+    psfs = dict(psf) if hasattr(psf, 'items') else {'': psf}
+    if layout is None:
+        widths = [np.ptp(one.grid_xypos[:, 0]) + 2 * _node_distance({'': one})
+                  for one in psfs.values()]
+        left = np.cumsum([0, *widths[:-1]])
+        return psfs, {name: (x, 0) for name, x in zip(psfs, left,
+                                                      strict=True)}
+    missing = [name for name in psfs if name not in layout]
+    if missing:
+        words = ', '.join(map(repr, missing))
+        msg = ('layout must have a place for every detector, got none for '
+               f'{words}')
+        raise ValueError(msg)
+    return psfs, layout
+
+
+def _node_distance(psfs):
+    """Return the smallest distance of two lines of nodes [pix]."""
+    steps = [np.diff(np.unique(one.grid_xypos[:, axis]))
+             for one in psfs.values() for axis in (0, 1)]
+    steps = np.concatenate(steps)
+    return steps[steps > 1].min(initial=1e9) if (steps > 1).any() else 1.0
+
+
+def _focal_plane(ax, psfs, places):
+    """Outline the detectors and label the axes."""
+    for name, one in psfs.items():
+        low, high = (getattr(one.grid_xypos + places[name], side)(axis=0)
+                     for side in ('min', 'max'))
+        ax.plot([low[0], high[0], high[0], low[0], low[0]],
+                [low[1], low[1], high[1], high[1], low[1]], color=BLACK,
+                linewidth=0.5)
+        if name:
+            ax.annotate(name, (low + high) / 2, ha='center', va='center')
+    ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal')
+    return ax
