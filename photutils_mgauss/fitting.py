@@ -309,6 +309,8 @@ def _as_origin(origin, shape):
 
 def _as_weights(error, mask, shape):
     """Return the weights (n, ny, nx), 0 for pixels that are masked."""
+    if error is None and mask is None:
+        return np.broadcast_to(1.0, shape)  # one number in memory
     used = np.broadcast_to(True, shape)
     if mask is not None:
         mask = np.asarray(mask)
