@@ -1559,8 +1559,9 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed, rows,
     idle_matrix, idle_gradient = factor, step
     cost = project(stamp, weight, centre, shapes, tie, signed, rows, fluxes,
                    scratch)
-    normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
-                     matrix, gradient)
+    if max_steps > 0:
+        normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
+                         matrix, gradient)
     cost += add_penalties(shapes, limits, matrix, gradient)
     damping, growth, small = 1e-2, 2.0, 0
     for n_steps in range(1, max_steps + 1):
@@ -1580,13 +1581,15 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed, rows,
         drop = cost - trial_cost
         shapes[:] = trial
         fluxes[:] = trial_fluxes
-        normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
-                         matrix, gradient)
-        add_penalties(shapes, limits, matrix, gradient)
         small = small + 1 if drop <= tolerance * cost else 0
         cost = trial_cost
         if small >= 2:
             return cost, FIT_CONVERGED, n_steps
+        if n_steps == max_steps:
+            break
+        normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
+                         matrix, gradient)
+        add_penalties(shapes, limits, matrix, gradient)
         quality = 2 * drop / max(gain, 1e-300) - 1
         damping = max(damping * max(0.2, 1 - quality ** 3), 1e-15)
         growth = 2.0

@@ -291,46 +291,43 @@ def _splits(shapes, problem):
     different elongation; the last start adds a Gaussian wider than all.
     """
     k = len(shapes)
-    children = _children(shapes, problem)
+    children = shapes[:, None, None] + _moves(shapes, problem)
+    others = np.nonzero(~np.eye(k, dtype=bool))[1].reshape(k, k - 1)
     starts = np.empty((k, children.shape[1], k + 1, 5))
-    for i in range(k):
-        starts[i, :, :-2] = np.delete(shapes, i, axis=0)
-        starts[i, :, -2:] = children[i]
+    starts[:, :, :-2] = shapes[others][:, None]
+    starts[:, :, -2:] = children
     widest = shapes[np.argmin(shapes[:, 2] + shapes[:, 4])]
-    last = np.vstack([shapes, _scaled(widest, 2.5)])
+    last = np.vstack([shapes, widest + _widening(widest[3], 2.5)])
     return np.concatenate([starts.reshape(-1, k + 1, 5), last[None]])
 
 
-def _children(parents, problem):
-    """Return what parents (K, 5) are split into, (K, n, 2, 5)."""
-    stretch = np.array([0, 0, 0.4, 0, -0.4])
-    shear = np.zeros_like(parents)
-    shear[:, 3] = 0.5 * np.exp(parents[:, 4])
-    pairs = [(_scaled(parents, 1 / 1.5), _scaled(parents, 1.5)),
-             (parents + stretch, parents - stretch),
-             (parents + shear, parents - shear)]
-    if not problem.fixed:
-        pairs += [(_shifted(parents, 1, offset), _shifted(parents, -1, offset))
-                  for offset in ((0.6, 0.0), (0.0, 0.6))]
-    if problem.signed:  # a hole in a Gaussian narrower than the parent
-        pairs += [(_scaled(parents, 0.5), _scaled(parents, 0.8))]
-    return np.moveaxis(np.array(pairs), 2, 0)
+def _moves(shapes, problem):
+    """Return how each parent's two children differ from it, (K, n, 2, 5)."""
+    length, t, m = np.exp(shapes[:, 2]), shapes[:, 3], np.exp(shapes[:, 4])
+    moves = np.zeros((len(shapes), 6, 2, 5))
+    for i, factor in enumerate((1 / 1.5, 1.5)):
+        sign = 1 - 2 * i
+        width, stretch, shear, along_x, along_y, hole = np.swapaxes(
+            moves[:, :, i], 0, 1)
+        width[:] = _widening(t, factor)
+        stretch[:, 2], stretch[:, 4] = 0.4 * sign, -0.4 * sign
+        shear[:, 3] = 0.5 * sign * m
+        # By 0.6 where the parent is a circle of radius 1.
+        along_x[:, 0] = 0.6 * sign / length
+        along_y[:, 1] = 0.6 * sign / m
+        along_y[:, 0] = -0.6 * sign * t / (m * length)
+        # A hole in a Gaussian narrower than the parent.
+        hole[:] = _widening(t, (0.5, 0.8)[i])
+    wanted = [True, True, True, *2 * [not problem.fixed], problem.signed]
+    return moves[:, wanted]
 
 
-def _scaled(shapes, factor):
-    """Return Gaussians with their widths times a factor."""
-    shift = np.log(factor)
-    scaled = shapes - shift * np.array([0, 0, 1, 0, 1])
-    scaled[..., 3] /= factor
-    return scaled
-
-
-def _shifted(shapes, sign, offset):
-    """Return them moved by an offset in the frame where each is a circle."""
-    x, y, log_l, t, log_m = shapes.T
-    dy = sign * offset[1] / np.exp(log_m)
-    dx = (sign * offset[0] - t * dy) / np.exp(log_l)
-    return np.column_stack([x + dx, y + dy, log_l, t, log_m])
+def _widening(t, factor):
+    """Return what multiplies the widths of Gaussians by a factor, (..., 5)."""
+    move = np.zeros((*np.shape(t), 5))
+    move[..., 2] = move[..., 4] = -np.log(factor)
+    move[..., 3] = t / factor - t
+    return move
 
 
 # Between shapes and mixtures.
