@@ -568,6 +568,22 @@ def test_parallaxes_need_a_sky(rng):
         ProperMotionFitter(parallax=True).fit(epochs)
 
 
+def test_an_epoch_without_stars_lacks_references(rng):
+    epochs = observe(make_truth(rng, n_stars=50, n_qso=50), rng)[:3]
+    empty = Epoch(epochs[2].table[:0], epochs[2].wcs, epochs[2].time)
+    with pytest.raises(ValueError, match='epoch 2 must have at least 3 '):
+        ProperMotionFitter(references='qso').fit([*epochs[:2], empty])
+
+
+@pytest.mark.parametrize(('keywords', 'kind', 'words'), [
+    ({'references': 3}, TypeError, 'references must be a table.*got 3'),
+    ({'ref_epoch': np.nan}, ValueError, 'ref_epoch must be finite'),
+    ({'ref_epoch': 57388.5}, ValueError, 'ref_epoch must be .*57388.5')])
+def test_what_is_found_out_in_the_fit_is_named(rng, keywords, kind, words):
+    with pytest.raises(kind, match=words):
+        ProperMotionFitter(**keywords).fit(plane_epochs(rng)[0])
+
+
 def test_a_single_epoch_is_refused(rng):
     epochs, _ = plane_epochs(rng)
     with pytest.raises(ValueError, match='at least 2'):
@@ -792,6 +808,20 @@ def test_matching_on_the_sky_gives_what_identifiers_give(scene, solution,
     same = fit.stars['n_obs'][i] == solution.stars['n_obs'][j]
     assert same.mean() > 0.98
     assert np.nanmax(np.abs(away[same].value)) < 0.2
+
+
+def test_pixels_with_a_unit_give_what_plain_ones_do(rng):
+    epochs = observe(make_truth(rng, n_stars=50, n_qso=50), rng)
+    units = dict.fromkeys(('x_fit', 'y_fit', 'x_err', 'y_err'), u.pix)
+    for epoch in epochs:
+        epoch.wcs.pixel_shape = None
+    measured = [Epoch(QTable(epoch.table, units=units), epoch.wcs,
+                      epoch.time) for epoch in epochs]
+    one, two = (ProperMotionFitter(references='qso').fit(some)
+                for some in (epochs, measured))
+    assert_allclose(two.stars['pmra'], one.stars['pmra'])
+    assert_allclose(*(fit.epochs[0].wcs.pixel_to_world_values(10, 20)
+                      for fit in (one, two)), rtol=1e-15)
 
 
 def test_row_numbers_of_photutils_are_not_identifiers(scene):
