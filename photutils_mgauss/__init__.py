@@ -8,7 +8,7 @@ The data flow, top to bottom::
                                           photometry, crowded
                  one QTable per exposure  <--------------+
                             |
-       matching, alignment -> proper_motion -> report, plotting
+       matching, alignment -> proper_motion -> tables, plotting
 
 Every public name is loaded on first use, so that importing the package costs
 little more than importing photutils.

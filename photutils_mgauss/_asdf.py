@@ -2,7 +2,7 @@
 The package's objects in ASDF trees.
 
 asdf finds this module by entry points and loads it with the first file it
-opens: so it imports nothing but asdf. The objects' own modules load when one
+opens: so it imports little but asdf. The objects' own modules load when one
 of them is read.
 """
 from contextlib import contextmanager
@@ -11,6 +11,8 @@ from importlib.resources import files
 import asdf
 import numpy as np
 from asdf.extension import Converter, Extension, TagDefinition
+
+from photutils_mgauss._stored import VERSION, check_version, complete
 
 _BASE = 'asdf://photutils_mgauss/'
 
@@ -51,7 +53,6 @@ class TablesConverter(Converter):
 
     def to_yaml_tree(self, obj, tag, ctx):
         """Return plain lists and arrays."""
-        from photutils_mgauss._files import VERSION
         tables = {name: {column: _plain(values)
                          for column, values in columns.items()}
                   for name, columns in obj._to_tables().items()}
@@ -60,7 +61,6 @@ class TablesConverter(Converter):
     def from_yaml_tree(self, node, tag, ctx):
         """Return the object."""
         import photutils_mgauss
-        from photutils_mgauss._files import check_version, complete
         check_version(node['version'], 'tree')
         name = tag.rpartition('/')[2].partition('-')[0]
         tables = {table: {column: np.array(values)

@@ -15,7 +15,6 @@ from photutils_mgauss import __version__
 
 # What is no option of a run.
 _NOT_STORED = ('run', 'quiet', 'overwrite')
-_TABLES = ('.ecsv', '.fits')
 
 
 class Progress:
@@ -79,13 +78,11 @@ def add_reading(parser):
         'all images or one for each.')
     group.add_argument('--ext', metavar='NAME',
                        help='extension with the image: 1, SCI or SCI,2')
-    for name, words in (('error', 'standard deviations'),
-                        ('weight', 'inverse variances'),
+    for name, words in (('error', 'standard deviations of the pixels'),
+                        ('weight', 'inverse variances of the pixels'),
                         ('flags', 'flags of bad pixels'),
                         ('wcs', 'WCS, as ASDF or FITS header')):
-        group.add_argument(f'--{name}', nargs='+', metavar='FILE',
-                           help=f'{words} of the pixels' if name != 'wcs'
-                           else words)
+        group.add_argument(f'--{name}', nargs='+', metavar='FILE', help=words)
     group.add_argument('--good-bits', type=int, metavar='BITS',
                        help='sum of the bits of the flags that do not make '
                             'a pixel bad')
@@ -289,13 +286,6 @@ def write_table(table, path, record):
         # FITS has no electrons; astropy notes them down all the same.
         warnings.filterwarnings('ignore', 'The unit .* could not be saved')
         table.write(draft)
-
-
-def check_table_name(path):
-    """Raise unless tables can be written under this name."""
-    if path.suffix not in _TABLES:
-        msg = f'{path}: must end with {" or ".join(_TABLES)}'
-        raise ValueError(msg)
 
 
 def read_table(path):

@@ -14,10 +14,9 @@ import numpy as np
 from astropy.io import fits, registry
 from astropy.io.fits.connect import is_fits
 
-__all__ = ['VERSION', 'check_version', 'storable']
+from photutils_mgauss._stored import VERSION, check_version, complete
 
-# Of the layout of the files. A reader takes every version up to its own.
-VERSION = 1
+__all__ = ['storable', 'table_columns']
 
 
 class _Read(registry.UnifiedReadWrite):
@@ -123,26 +122,6 @@ def table_columns(table):
     columns = {name: np.asarray(table[name]) for name in table.colnames}
     return {name: column.astype(str) if column.dtype.kind == 'O' else column
             for name, column in columns.items()}
-
-
-def check_version(version, name):
-    """Raise unless files of this version can be read."""
-    if not 1 <= version <= VERSION:
-        msg = (f'{name} must be of version {VERSION} or older, got version '
-               f'{version}: it was written by a newer photutils_mgauss')
-        raise ValueError(msg)
-
-
-def complete(cls, tables, name):
-    """Return an object made of tables, if no column is missing."""
-    missing = [f'{column!r} of {table!r}'
-               for table, columns in cls._columns.items()
-               for column in columns if column not in tables.get(table, {})]
-    if missing:
-        msg = (f'{name} must hold all columns of a {cls.__name__}, got none '
-               f'for {", ".join(missing)}')
-        raise ValueError(msg)
-    return cls._from_tables(tables)
 
 
 def _write_fits(stored, file, *, overwrite=False):

@@ -2,7 +2,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from photutils_mgauss._joint import (
     Estimates,
@@ -21,6 +20,7 @@ from photutils_mgauss._stacked import invert_2x2
 from photutils_mgauss.alignment import (
     Frames,
     Gauge,
+    chi2_limit,
     floor_variance,
     solve_frames,
     worst_outliers,
@@ -174,7 +174,7 @@ def _with_references(scene):
     priors = build_priors(_select(catalogue, use, use.sum()), stars[use],
                           scene.origin[:, stars[use]], scene.working_year,
                           sightings.unit, n_star_parameters(options))
-    priors = _add_parallax_prior(priors, scene, stars)
+    priors = _add_parallax_prior(priors, scene)
     relative = not anchors.any()
     if relative:
         anchors = np.ones(n, dtype=bool)
@@ -205,7 +205,7 @@ def _hold_out(stars, options):
     return np.sort(rng.choice(stars, n, replace=False))
 
 
-def _add_parallax_prior(priors, scene, references):
+def _add_parallax_prior(priors, scene):
     """Give stars of unknown parallax the one expected of them."""
     if scene.options.parallax != 'prior':
         return priors
@@ -434,7 +434,7 @@ def _review(scene, state, problem, frames, fits_floor):
             return replace(state, floor=floor), True
     estimates = solve_all(problem, frames.correction, frames.factor,
                           scene.options.executor, judge=True)
-    dropped = _discrepant(scene, state, problem, frames, estimates)
+    dropped = _discrepant(scene, problem, frames)
     if len(dropped):
         return replace(state, dropped=np.union1d(state.dropped,
                                                  dropped)), True
@@ -450,9 +450,9 @@ def _review(scene, state, problem, frames, fits_floor):
 def _inconsistent(scene, problem, estimates):
     """Return stars (n,) that no more rejections can make agree."""
     dof = 2 * (problem.weights[0] > 0).sum(axis=0) - problem.n_parameters
-    tail = 2 * stats.norm.sf(scene.options.clip)
     chi2 = np.nansum(estimates.raw, axis=0)
-    out = (dof > 0) & (chi2 > stats.chi2.isf(tail, np.maximum(dof, 1)))
+    out = (dof > 0) & (chi2 > chi2_limit(scene.options.clip,
+                                         np.maximum(dof, 1)))
     # References agree with their catalogue, or are none any more.
     out[problem.priors.stars] &= ~scene.anchors[problem.priors.stars] | (
         scene.relative)
@@ -473,7 +473,7 @@ def prior_rank(priors):
                                  hermitian=True)
 
 
-def _discrepant(scene, state, problem, frames, estimates):
+def _discrepant(scene, problem, frames):
     """
     Return references whose catalogue values the data contradict.
 
@@ -492,8 +492,7 @@ def _discrepant(scene, state, problem, frames, estimates):
                         residuals=True)
     bound = data_chi2(with_it, alone) + alone.priors.chi2(with_it.values)
     rise = bound - data_chi2(without, free)
-    limit = stats.chi2.isf(2 * stats.norm.sf(scene.options.clip),
-                           prior_rank(alone.priors))
+    limit = chi2_limit(scene.options.clip, prior_rank(alone.priors))
     worst = np.nan_to_num(rise / limit, nan=0.0)
     # A few at a time: one bad reference pulls the frame from the others.
     most = max(1, len(stars) // 20)

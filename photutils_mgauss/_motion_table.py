@@ -436,7 +436,7 @@ def residual_table(fit):
                     'row': sightings.matches.rows[at]})
     years = np.broadcast_to(sightings.years, finite.shape)[at]
     table['time'] = years * u.yr
-    _add_aligned(table, fit, at, finite, unit)
+    _add_aligned(table, fit, at, unit)
     residual = np.where(finite, full.residuals, np.nan)
     left_out = _leave_one_out(full, covariance)
     for k, name in enumerate(('dra', 'ddec')):
@@ -448,7 +448,7 @@ def residual_table(fit):
     return table
 
 
-def _add_aligned(table, fit, at, finite, unit):
+def _add_aligned(table, fit, at, unit):
     scene, sightings = fit.scene, fit.scene.sightings
     aligned = np.stack([scene.transform.apply(one, sightings.places[:, e])
                         for e, one in enumerate(fit.state.maps)], axis=1)

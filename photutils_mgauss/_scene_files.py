@@ -10,6 +10,7 @@ the WCS (``_wcs.asdf``).
 from pathlib import Path
 
 import asdf
+import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
@@ -31,7 +32,9 @@ def write_scene(scene, path, layout, overwrite):
         raise FileExistsError(msg)
     for file, hdus in zip(paths, images.values(), strict=False):
         fits.HDUList(hdus).writeto(file, overwrite=True)
-    scene.truth.write(paths[-2], overwrite=True)
+    truth = scene.truth.copy()
+    truth['flux'] = truth['flux'].value * u.electron
+    truth.write(paths[-2], overwrite=True)
     asdf.AsdfFile({'wcs': scene.wcs}).write_to(paths[-1])
     return paths
 

@@ -1,4 +1,4 @@
-"""Images and source tables as the user hands them over."""
+"""Tables of sources as the user hands them over."""
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,19 +16,6 @@ class Sources:
     y: np.ndarray
     flux: np.ndarray
     selected: np.ndarray
-
-
-def as_image(value, name, shape=None):
-    """Return an image without copying it: it may be large."""
-    value = np.asanyarray(value)
-    if value.dtype.kind not in 'buif':
-        msg = f'{name} must be an array of numbers, got {value.dtype}'
-        raise TypeError(msg)
-    if value.ndim != 2 or (shape is not None and value.shape != shape):
-        want = '(ny, nx)' if shape is None else f'that of data, {shape}'
-        msg = f'{name} must have the shape {want}, got {value.shape}'
-        raise ValueError(msg)
-    return np.asarray(value)
 
 
 def read_sources(stars):

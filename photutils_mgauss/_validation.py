@@ -36,6 +36,29 @@ def as_floats(value, name, *, shape=None, finite=True):
     return array
 
 
+def as_image(value, name, shape=None):
+    """Return an image without copying it: it may be large."""
+    value = np.asanyarray(value)
+    if value.dtype.kind not in 'buif':
+        msg = f'{name} must be an array of numbers, got {value.dtype}'
+        raise TypeError(msg)
+    if value.ndim != 2 or (shape is not None and value.shape != shape):
+        want = '(ny, nx)' if shape is None else f'that of data, {shape}'
+        msg = f'{name} must have the shape {want}, got {value.shape}'
+        raise ValueError(msg)
+    return np.asarray(value)
+
+
+def as_stack(value, name):
+    """Copy one image or many to float64 (n, ny, nx); tell if it was one."""
+    images = as_floats(value, name, finite=False)
+    if images.ndim not in (2, 3) or 0 in images.shape:
+        msg = (f'{name} must have shape (ny, nx) or (n, ny, nx) and pixels, '
+               f'got {images.shape}')
+        raise ValueError(msg)
+    return images.reshape(-1, *images.shape[-2:]), images.ndim == 2
+
+
 def as_real(value, name, *, above=None, minimum=None, maximum=None):
     """Return ``value`` as a finite float within the limits given."""
     if isinstance(value, bool) or not isinstance(value, (Real, np.ndarray)):

@@ -8,7 +8,7 @@ combinations of them nothing determines, and judges each detection.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri, ndtr
 
 from photutils_mgauss._stacked import invert_2x2
 from photutils_mgauss._transforms import Transform, fit_map
@@ -204,6 +204,11 @@ def tie_plane(points, targets, weights, kind):
     return np.column_stack([start, slope])
 
 
+def chi2_limit(clip, dof):
+    """Return the chi-square as rare as a deviation by ``clip`` sigma."""
+    return chdtri(dof, 2 * ndtr(-clip))
+
+
 def worst_outliers(chi2, used, spare, clip):
     """
     Return which detections to reject now, (E, n): each star's worst.
@@ -212,7 +217,7 @@ def worst_outliers(chi2, used, spare, clip):
     residuals of the good; and only where ``spare`` (n,) says the star has
     detections enough to tell the bad one.
     """
-    limit = stats.chi2.isf(2 * stats.norm.sf(clip), 2)
+    limit = chi2_limit(clip, 2)
     chi2 = np.where(used, np.nan_to_num(chi2, nan=0.0), 0.0)
     worst = chi2.argmax(axis=0)
     out = np.zeros(used.shape, dtype=bool)

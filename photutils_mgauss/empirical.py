@@ -67,6 +67,8 @@ class EmpiricalPSF:
     <EmpiricalPSF(37 x 37 samples, oversampling=2, degree=0)>
     >>> empirical.to_gridded_psf((2, 3)).data.shape
     (6, 73, 73)
+    >>> empirical.image_at(20, 20).shape
+    (37, 37)
     """
 
     field: MixtureField
@@ -86,7 +88,8 @@ class EmpiricalPSF:
         Measure the PSF from the stars of one or more exposures.
 
         Positions and fluxes of the stars are those of a mixture field fitted
-        first; deviant stars and pixels are left out as there.
+        first; deviant stars and pixels are left out as there. The example
+        above makes one.
 
         Parameters
         ----------
@@ -111,20 +114,6 @@ class EmpiricalPSF:
         ------
         TypeError, ValueError
             If an argument is not valid or no star can be used.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> from astropy.table import Table
-        >>> from photutils_mgauss import EmpiricalPSF, GaussianMixture
-        >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0], [0, 2]]])
-        >>> stars = Table({'x': [12.3, 40.1], 'y': [14.6, 33.9]})
-        >>> data = sum(psf.render((50, 55), x, y, flux=900) for x, y in stars)
-        >>> empirical = EmpiricalPSF.from_stars(
-        ...     data, stars, error=np.ones((50, 55)), degree=0, radius=8,
-        ...     n_components=1)
-        >>> empirical.image_at(20, 20).shape
-        (37, 37)
         """
         oversampling = as_integer(oversampling, 'oversampling', minimum=1)
         field = fit_mixture_field(

@@ -32,14 +32,6 @@ _MAX_STEPS = 100
 # Of the expected next step, see _State.length.
 _TOLERANCE = 1e-6
 
-# The least factor by which steps are taken to get shorter.
-_LEAST_RATE = 0.03
-
-# Out of steps, fits whose chi2 fell by a smaller fraction than this in the
-# last one count as good, as they do in scipy: along a valley, such as that of
-# two stars in one place, steps may remain long.
-_LEAST_FALL = 1e-8
-
 # Matrices scaled to a diagonal of one whose Cholesky factor has a smaller
 # square than this on its diagonal are taken for singular.
 _SINGULAR = 1e-14
@@ -345,11 +337,11 @@ def _minimize(problem, max_steps):
         length = state.length(_undamped(problem, state, step, damping))
         gain, fall = _gain(state, new, step), state.chi2 - new.chi2
         state = new
-        if _remainder(length, last) < _TOLERANCE:
+        if _kernels._remainder(length, last) < _TOLERANCE:
             return state, 3, n + 2
         last, damping = length, _kernels._next_damping(
             damping, gain)
-    status = 2 if fall < _LEAST_FALL * state.chi2 else 0
+    status = 2 if fall < _kernels._LEAST_FALL * state.chi2 else 0
     return state, status, max_steps + 1
 
 
@@ -360,18 +352,6 @@ def _gain(state, new, step):
         return (state.chi2 - new.chi2) / expected
     # Of a smaller fall nothing is left after rounding: keep the damping.
     return _kernels._POOR_GAIN
-
-
-def _remainder(length, last):
-    """
-    Return how far the minimum is expected to be after a step.
-
-    Convergence is linear at the worst, each step shorter than the last one by
-    the same factor. A first step, with a last one of 0, says nothing of it,
-    and early steps make it look better than it will be.
-    """
-    rate = max(length / last, _LEAST_RATE) if last > 0 else 0.5
-    return length * (rate / (1 - rate) if rate < 0.9 else 10)
 
 
 def _undamped(problem, state, step, damping):

@@ -32,6 +32,7 @@ from photutils_mgauss._validation import (
     as_integer,
     as_real,
     as_shape,
+    as_stack,
 )
 from photutils_mgauss.mixture import GaussianMixture
 
@@ -254,13 +255,7 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
     >>> fit.mixture.weights
     array([0.8, 0.2])
     """
-    images = as_floats(image, 'image', finite=False)
-    if images.ndim not in (2, 3) or 0 in images.shape:
-        msg = ('image must have shape (ny, nx) or (n, ny, nx) and pixels, '
-               f'got {images.shape}')
-        raise ValueError(msg)
-    single = images.ndim == 2
-    images = images.reshape(-1, *images.shape[-2:])
+    images, single = as_stack(image, 'image')
     problem = Problem(
         n_components=as_integer(n_components, 'n_components', minimum=1),
         oversampling=as_shape(oversampling, 'oversampling'),

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from astropy.table import QTable
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import norm, rankdata
+from scipy.special import ndtri
 
 from photutils_mgauss._validation import as_choice, as_integer, as_real
 from photutils_mgauss.fitting import MixtureFit, fit_mixture
@@ -585,8 +585,9 @@ def _split(draws):
 def _normal_scores(draws):
     if np.ptp(draws) == 0:
         return np.zeros_like(draws)
+    from scipy.stats import rankdata
     rank = rankdata(draws).reshape(draws.shape)
-    return norm.ppf((rank - 0.375) / (draws.size + 0.25))
+    return ndtri((rank - 0.375) / (draws.size + 0.25))
 
 
 def _r_hat(chains):

@@ -14,7 +14,7 @@ import numpy as np
 
 from photutils_mgauss import _kernels
 from photutils_mgauss._parallel import map_chunks
-from photutils_mgauss._validation import as_floats, as_shape
+from photutils_mgauss._validation import as_floats, as_shape, as_stack
 from photutils_mgauss.mixture import GaussianMixture
 
 __all__ = ['ShapeStatus', 'Shapes', 'adaptive_moments']
@@ -262,13 +262,7 @@ def _as_mixtures(value):
 
 def _as_images(image, error, mask):
     """Return images, used pixels and variances (n, ny, nx), and if single."""
-    images = as_floats(image, 'image', finite=False)
-    if images.ndim not in (2, 3) or 0 in images.shape:
-        msg = ('image must have shape (ny, nx) or (n, ny, nx) and pixels, '
-               f'got {images.shape}')
-        raise ValueError(msg)
-    single = images.ndim == 2
-    images = images.reshape(-1, *images.shape[-2:])
+    images, single = as_stack(image, 'image')
     used = np.ones(images.shape, bool)
     if mask is not None:
         used &= ~np.asarray(mask, bool)

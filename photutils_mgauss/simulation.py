@@ -67,8 +67,8 @@ class Scene:
         hot, 8 dead, 16 bad column.
     truth : `~astropy.table.QTable`
         The sources on the image and close to it: ``id``, ``x``, ``y``
-        [pix], ``flux`` [electron], ``mag``, ``inside``, and the other
-        columns of the catalogue.
+        [pix], ``flux`` in electrons, numbers like the image, ``mag``,
+        ``inside``, and the other columns of the catalogue.
     psf : GriddedMixturePSF or `~photutils.psf.GriddedPSFModel`
         The true PSF.
     background : float
@@ -208,8 +208,8 @@ def simulate(sources, exposure=None, *, instrument=None, psf=None,
     >>> stars = sparse_field((256, 256), rng=1)
     >>> scene = simulate(stars, instrument=Instrument(shape=(256, 256)),
     ...                  rng=2)
-    >>> scene.image.shape, scene.truth['flux'].unit
-    ((256, 256), Unit("electron"))
+    >>> scene.image.shape
+    (256, 256)
     """
     rng = np.random.default_rng(rng)
     exposure = Exposure() if exposure is None else exposure
@@ -221,6 +221,8 @@ def simulate(sources, exposure=None, *, instrument=None, psf=None,
     wcs = exposure.wcs(instrument.shape, instrument.pixel_scale)
     truth = _truth(sources, exposure, instrument, wcs)
     chip = Chip(instrument, effects, exposure)
+    # Photutils wants fluxes with the unit of the image, which has none.
+    truth['flux'] = truth['flux'].value
     electrons, flags = expose(chip, truth, psf, rng, executor)
     image, error = read(chip, electrons, rng, executor)
     return Scene(image, error, flags, truth, psf, chip.sky, exposure,

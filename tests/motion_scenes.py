@@ -10,7 +10,7 @@ from astropy.wcs import WCS
 
 from photutils_mgauss import Epoch
 
-# Observing times of Table 1 of Nie et al.
+# Observing times of Table 2 of Nie et al.
 TIMES = Time(['2024-12-12T08:07:10', '2026-05-30T17:27:18',
               '2026-08-11T02:49:27', '2026-08-11T05:50:40',
               '2027-08-09T07:50:24', '2027-08-09T09:19:18',
@@ -123,14 +123,37 @@ def observe(truth, rng, *, times=TIMES, offset=100.0, edge=0.0, missing=0.1,
     return epochs
 
 
-def match_truth(stars, truth):
-    """Return the number of the true source of each star of a table."""
-    return np.asarray(stars['id'], dtype=int)
-
-
 def pulls(stars, truth, *, names=('pmra', 'pmdec')):
     """Return (value - truth) / error of motions, shape (2, n)."""
-    which = match_truth(stars, truth)
+    which = np.asarray(stars['id'], dtype=int)
     return np.stack([
         (stars[name].value - truth.pm[k, which]) / stars[f'{name}_error'].value
         for k, name in enumerate(names)])
+
+
+def rms(values):
+    """Return the root of the mean square of all but NaN."""
+    return np.sqrt(np.nanmean(np.square(values)))
+
+
+def plane_epochs(rng, n=40, years=(2020.0, 2021.5, 2024.0), error=0.01,
+                 **columns):
+    """Return epochs in pixels, with errors, and the true motions."""
+    place, motion = rng.uniform(0, 500, (2, n)), rng.normal(0, 0.1, (2, n))
+    epochs = []
+    for year in years:
+        x, y = (place + motion * (year - years[0])
+                + rng.normal(0, error, (2, n)))
+        epochs.append(Epoch(Table({
+            'id': np.arange(n), 'x_fit': x, 'y_fit': y,
+            'x_err': np.full(n, error), 'y_err': np.full(n, error),
+            **columns}), time=year))
+    return epochs, motion
+
+
+def changed(epoch, **columns):
+    """Return an epoch with some columns of its table replaced."""
+    table = epoch.table.copy()
+    for name, values in columns.items():
+        table[name] = values
+    return Epoch(table, epoch.wcs, epoch.time, observer=epoch.observer)

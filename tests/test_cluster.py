@@ -5,7 +5,7 @@ import warnings
 
 import pytest
 from numpy.testing import assert_array_equal
-from test_gridded_sources import assert_is_truth, epsf_grid
+from psf_grids import assert_is_truth, epsf_grid
 
 from photutils_mgauss import GriddedMixturePSF
 

@@ -13,7 +13,7 @@ from astropy.io import fits
 from astropy.table import QTable, Table
 from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_array_equal
-from test_gridded import make_grid, some_mixture
+from psf_grids import make_grid, some_mixture
 
 from photutils_mgauss import (
     GaussianMixture,

@@ -3,15 +3,15 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from astropy.nddata import NDData
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
-from photutils.psf import (
-    EPSFBuilder,
-    EPSFStar,
-    EPSFStars,
-    GriddedPSFModel,
-    ImagePSF,
+from photutils.psf import EPSFBuilder, EPSFStar, EPSFStars, ImagePSF
+from psf_grids import (
+    PLACES,
+    PlainGrid,
+    assert_is_truth,
+    epsf_grid,
+    truth_at,
 )
 from test_psf_io import MODELS, X, Y, write_model
 
@@ -21,53 +21,6 @@ from photutils_mgauss import (
     fit_mixture,
     read_psfex,
 )
-
-PLACES = [(x, y) for y in (0, 40, 100) for x in (0, 50, 80)]
-
-
-def truth_at(x, y, k=2):
-    """Return a mixture that changes with position."""
-    sizes = np.array([1.2, 2.6, 4.5])[:k]
-    stddevs = np.column_stack([sizes * (1 + x / 1000), sizes * (1 + y / 800)])
-    weights = np.array([0.7, 0.2, 0.1])[:k]
-    return GaussianMixture.from_stddevs(
-        weights / weights.sum(), np.column_stack([x * sizes, y * sizes])
-        / 2000, stddevs, np.full(k, 0.1))
-
-
-def truth_grid():
-    return GriddedMixturePSF([truth_at(x, y) for x, y in PLACES], PLACES)
-
-
-def epsf_grid(change=None, oversampling=3):
-    """Return photutils' grid of the truth, its images changed."""
-    grid = truth_grid()
-    steps = np.arange(-36, 37) / oversampling
-    data = np.array([1.06 * mixture.evaluate(steps, steps[:, None])
-                     for mixture in grid.mixtures])
-    if change is not None:
-        change(data)
-    meta = {'grid_xypos': PLACES, 'oversampling': oversampling}
-    if np.isnan(data).any():
-        # Photutils refuses such images in a model; files hold them.
-        return _Plain(data, meta)
-    return GriddedPSFModel(NDData(data, meta=meta))
-
-
-class _Plain:
-    def __init__(self, data, meta):
-        self.data = data
-        self.grid_xypos = meta['grid_xypos']
-        self.oversampling = meta['oversampling']
-
-
-def assert_is_truth(psf, scale=1.06, nodes=range(9), rtol=1e-3):
-    steps = np.arange(-6, 7.0)
-    for m in nodes:
-        expected = truth_at(*PLACES[m]).evaluate(steps, steps[:, None])
-        found = psf.mixtures[m].evaluate(steps, steps[:, None])
-        assert_allclose(found, expected, atol=rtol * expected.max())
-    assert_allclose(psf.scales[list(nodes)], scale, rtol=1e-3)
 
 
 def test_the_mixtures_of_an_epsf_grid_and_its_flux_scale_come_back():
@@ -176,7 +129,7 @@ def test_two_chips_side_by_side_have_a_seam():
     data = epsf_grid().data[:1].repeat(8, axis=0)
     places = [(x, y) for y in (0, 20, 20, 40) for x in (5, 9)]
     psf = GriddedMixturePSF.from_gridded_psf(
-        _Plain(data, {'grid_xypos': places, 'oversampling': 3}), 2)
+        PlainGrid(data, {'grid_xypos': places, 'oversampling': 3}), 2)
     assert_array_equal(psf.grid_xypos[::2, 1], [0, 20, 21, 40])
     assert_array_equal(psf.grid_xypos[:2, 0], [5, 9])
 

@@ -67,13 +67,11 @@ def upward_imports(name, tree):
             if LAYERS[other] > LAYERS[name]]
 
 
-def top_level_imports(tree):
-    """Return the modules of ours that are loaded together with a module."""
-    inside = {node for function in ast.walk(tree)
-              if isinstance(function, ast.FunctionDef)
-              for node in ast.walk(function)}
+def all_imports(tree):
+    """Return the modules of ours that a module imports, now or later."""
+    allowed = allowed_plotting(tree)
     return set().union(*(own_modules(node) for node in ast.walk(tree)
-                         if node not in inside))
+                         if node not in allowed))
 
 
 def run(code):
@@ -95,7 +93,7 @@ def test_imports_go_downward(name):
 
 
 def test_no_two_modules_import_each_other():
-    graph = {name: top_level_imports(parse(name)) for name in KNOWN}
+    graph = {name: all_imports(parse(name)) for name in KNOWN}
     TopologicalSorter(graph).prepare()
 
 

@@ -24,7 +24,7 @@ from photutils.psf import (
     SourceGrouper,
     make_psf_model_image,
 )
-from test_gridded import make_grid, some_mixture
+from psf_grids import make_grid, some_mixture
 
 from photutils_mgauss import (
     GaussianMixture,

@@ -12,8 +12,7 @@ from astropy.nddata import NDData
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import GriddedPSFModel, PSFPhotometry, SourceGrouper
-from test_gridded import make_grid, some_mixture
-from test_gridded_sources import PLACES, epsf_grid
+from psf_grids import PLACES, epsf_grid, make_grid, some_mixture
 from test_photutils import check, draw, narrow_mixture, nearby
 from test_psf_io import X, Y, write_model
 

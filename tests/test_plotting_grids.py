@@ -2,8 +2,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from test_gridded import make_grid
-from test_gridded_sources import epsf_grid
+from psf_grids import epsf_grid, make_grid
 
 from photutils_mgauss import (
     GaussianMixture,

@@ -1,16 +1,19 @@
-"""ProperMotionFitter beside the truth, published values and other fits."""
+"""ProperMotionFitter beside the truth and other fits."""
 from concurrent.futures import ThreadPoolExecutor
 
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import Angle, SkyCoord
+from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
 from motion_scenes import (
     TIMES,
+    changed,
     make_truth,
     observe,
+    plane_epochs,
     pulls,
+    rms,
     tan_wcs,
 )
 from numpy.testing import assert_allclose
@@ -19,35 +22,7 @@ from photutils_mgauss import (
     Epoch,
     ProperMotionFitter,
     bootstrap_median,
-    decode_motion_flags,
 )
-
-
-def rms(values):
-    return np.sqrt(np.nanmean(np.square(values)))
-
-
-def plane_epochs(rng, n=40, years=(2020.0, 2021.5, 2024.0), error=0.01,
-                 **columns):
-    """Return epochs in pixels, with errors, and the true motions."""
-    place, motion = rng.uniform(0, 500, (2, n)), rng.normal(0, 0.1, (2, n))
-    epochs = []
-    for year in years:
-        x, y = (place + motion * (year - years[0])
-                + rng.normal(0, error, (2, n)))
-        epochs.append(Epoch(Table({
-            'id': np.arange(n), 'x_fit': x, 'y_fit': y,
-            'x_err': np.full(n, error), 'y_err': np.full(n, error),
-            **columns}), time=year))
-    return epochs, motion
-
-
-def changed(epoch, **columns):
-    """Return an epoch with some columns of its table replaced."""
-    table = epoch.table.copy()
-    for name, values in columns.items():
-        table[name] = values
-    return Epoch(table, epoch.wcs, epoch.time, observer=epoch.observer)
 
 
 @pytest.fixture(scope='module')
@@ -303,203 +278,7 @@ def test_any_declination_and_rotation_gives_the_motions(dec, rotation):
                     atol=0.005)
 
 
-# Published values
-
-def test_the_pulsar_b0950_has_its_published_motion(realdata):
-    epochs = []
-    lines = (realdata('vlba_b0950') / 'example.pmpar').read_text()
-    for line in lines.splitlines():
-        words = line.split()
-        if len(words) < 5 or ':' not in words[1]:
-            continue
-        dec = Angle(words[3], unit=u.deg).deg
-        seconds = 15e3 * np.cos(np.radians(dec))
-        epochs.append(Epoch(Table({
-            'ra': [Angle(words[1], unit=u.hourangle).deg], 'dec': [dec],
-            'ra_error': [float(words[2]) * seconds],
-            'dec_error': [float(words[4]) * 1e3]}), time=float(words[0])))
-    star = ProperMotionFitter(transform=None, parallax=True).fit(
-        epochs).stars[0]
-    for name, value, error in (('pmra', -1.67, 0.42), ('pmdec', 29.33, 0.28),
-                               ('parallax', 3.69, 0.17)):
-        assert_allclose(star[name].value, value, atol=0.006)
-        assert_allclose(star[f'{name}_error'].value, error, atol=0.006)
-    assert_allclose([star['chi2'], star['dof']], [2.16, 3], atol=0.006)
-
-
-def keck(folder):
-    """Return the epochs and the label table of keck_ob150029."""
-    names = ['name', 'm', 't', 'x', 'y', 'xe', 'ye', 'snr', 'corr',
-             'n_frames', 'flux']
-    epochs = []
-    for path in sorted(folder.glob('mag*.lis')):
-        rows = [line.split() for line in path.read_text().splitlines()[1:]]
-        table = Table(dict(zip(names, map(list, zip(*rows, strict=True)),
-                               strict=True)))
-        positions = {new: table[old].astype(float) for old, new in (
-            ('x', 'x'), ('y', 'y'), ('xe', 'x_err'), ('ye', 'y_err'))}
-        epochs.append(Epoch(Table({'id': table['name'], **positions}),
-                            time=float(table['t'][0])))
-    names = ['id', 'kp', 'x', 'y', 'xerr', 'yerr', 'pmra', 'pmdec',
-             'pmra_error', 'pmdec_error', 't0']
-    rows = [line.split()[:11] for line in (
-        folder / 'ob150029_label.txt').read_text().splitlines()[1:]]
-    label = Table(dict(zip(names, map(list, zip(*rows, strict=True)),
-                           strict=True)))
-    for name in names[1:]:
-        label[name] = label[name].astype(float)
-    return epochs, label[label['pmra_error'] > 0]
-
-
-def label_catalogue(label):
-    catalogue = QTable({'id': label['id'], 'ref_epoch': label['t0']})
-    for name in ('x', 'y'):
-        catalogue[name] = label[name] * u.arcsec
-        catalogue[f'{name}_error'] = np.full(len(label), 1.0) * u.mas
-    for name in ('pmra', 'pmdec', 'pmra_error', 'pmdec_error'):
-        catalogue[name] = label[name] * u.mas / u.yr
-    return catalogue
-
-
-def differences(stars, label):
-    """Return the motions of a table minus the published ones [mas/yr]."""
-    row = {name: i for i, name in enumerate(stars['id'])}
-    both = [(row[name], k) for k, name in enumerate(label['id'])
-            if name in row]
-    i, k = np.array(both).T
-    away = np.stack([stars[name][i].to_value(u.mas / u.yr) - label[name][k]
-                     for name in ('pmra', 'pmdec')])
-    return away[:, np.isfinite(away).all(axis=0)]
-
-
-@pytest.mark.parametrize(('transform', 'recipe'), [
-    ('affine', 'joint'), ('affine', 'two-step'), ('poly-2', 'joint')])
-def test_keck_motions_agree_with_the_published_ones(realdata, transform,
-                                                    recipe):
-    epochs, label = keck(realdata('keck_ob150029'))
-    fit = ProperMotionFitter(references=label_catalogue(label),
-                             transform=transform, recipe=recipe).fit(epochs)
-    away = differences(fit.measured(), label)
-    assert away.shape[1] >= 90
-    middle = np.median(away, axis=1)
-    assert (np.abs(middle) < 0.04).all()
-    spread = np.median(np.abs(away - middle[:, None]), axis=1)
-    assert (spread <= [0.19, 0.30]).all()
-    sizes = np.linalg.svd(fit.alignment['matrix'])[1]
-    assert ((sizes > 9.92) & (sizes < 9.94)).all()
-
-
-def test_two_keck_epochs_give_motions(realdata):
-    epochs, label = keck(realdata('keck_ob150029'))
-    fit = ProperMotionFitter(references=label_catalogue(label)).fit(
-        [epochs[0], epochs[-1]])
-    stars = fit.measured()
-    away = differences(stars, label)
-    assert away.shape[1] >= 80
-    middle = np.median(away, axis=1)
-    spread = np.median(np.abs(away - middle[:, None]), axis=1)
-    assert (spread < 0.6).all()
-    for name in ('chi2', 'dof', 'uwe'):
-        assert np.isnan(stars[name]).all()
-
-
-# What goes wrong: an error for what cannot be fitted, a flag for one star
-
-def test_epochs_without_common_stars_raise(rng):
-    epochs, _ = plane_epochs(rng)
-    epochs = [changed(epoch, id=epoch.table['id'] + 100 * k)
-              for k, epoch in enumerate(epochs)]
-    with pytest.raises(ValueError, match='epochs must have stars in common'):
-        ProperMotionFitter().fit(epochs)
-
-
-def test_no_time_baseline_raises(rng):
-    epochs, _ = plane_epochs(rng, years=(2020.0, 2020.0))
-    with pytest.raises(ValueError, match='time baseline'):
-        ProperMotionFitter().fit(epochs)
-
-
-def test_exposures_of_one_time_are_data(rng):
-    epochs, _ = plane_epochs(rng, years=(2020.0, 2020.0, 2024.0, 2024.0))
-    fit = ProperMotionFitter(transform='shift', systematic=None).fit(epochs)
-    # Two exposures at each end halve the variance of one.
-    assert_allclose(np.median(fit.stars['pmra_error'].value), 0.01 / 4,
-                    rtol=0.02)
-    assert (fit.stars['flags'] & 1 == 0).all()
-
-
-@pytest.mark.parametrize(('transform', 'n'), [
-    ('shift', 0), ('similarity', 1), ('affine', 2), ('poly-2', 5)])
-def test_too_few_references_raise(rng, transform, n):
-    epochs, _ = plane_epochs(rng)
-    marked = [changed(epoch, qso=np.arange(40) < max(n, 1))
-              for epoch in epochs]
-    if n == 0:
-        marked[1] = changed(marked[1], x_err=np.where(
-            marked[1].table['qso'], np.nan, 0.01))
-    with pytest.raises(ValueError, match=f'got {n}$'):
-        ProperMotionFitter(transform=transform, references='qso').fit(marked)
-
-
-@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
-def test_a_position_that_is_not_finite_is_flagged(rng, value):
-    epochs, _ = plane_epochs(rng)
-    clean = ProperMotionFitter(systematic=None).fit(epochs)
-    epochs[1].table['x_fit'][3] = value
-    fit = ProperMotionFitter(systematic=None).fit(epochs)
-    assert [words.split(':')[0] for words in decode_motion_flags(
-        fit.stars['flags'][3])] == ['bad_position', 'relative']
-    assert fit.stars['n_good_obs'][3] == 2
-    assert np.isfinite(fit.stars['pmra']).all()
-    others = np.arange(40) != 3
-    assert_allclose(fit.stars['pmra'][others].value,
-                    clean.stars['pmra'][others].value, atol=0.003)
-
-
-def test_a_masked_position_is_flagged(rng):
-    epochs, _ = plane_epochs(rng)
-    table = Table(epochs[1].table, masked=True)
-    table['y_fit'].mask[5] = True
-    epochs[1] = Epoch(table, time=epochs[1].time)
-    stars = ProperMotionFitter().fit(epochs).stars
-    assert np.flatnonzero(stars['flags'] & 4).tolist() == [5]
-
-
-@pytest.mark.parametrize('error', [0.0, -1.0, np.nan, np.inf])
-def test_an_error_that_is_not_positive_has_no_weight(rng, error):
-    epochs, _ = plane_epochs(rng)
-    epochs[2].table['y_err'][7] = error
-    stars = ProperMotionFitter().fit(epochs).stars
-    assert np.flatnonzero(stars['flags'] & 2).tolist() == [7]
-    assert stars['n_good_obs'][7] == 2
-    assert stars['n_obs'][7] == 3
-
-
-def test_a_singular_covariance_has_no_weight(rng):
-    epochs, _ = plane_epochs(rng)
-    epochs = [changed(epoch, xy_cov=np.zeros(40)) for epoch in epochs]
-    epochs[0].table['xy_cov'][2] = 0.01**2
-    stars = ProperMotionFitter().fit(epochs).stars
-    assert np.flatnonzero(stars['flags'] & 2).tolist() == [2]
-
-
-def test_a_star_seen_once_is_nan_and_flagged(rng):
-    epochs, _ = plane_epochs(rng)
-    epochs[1] = Epoch(epochs[1].table[1:], time=epochs[1].time)
-    epochs[2] = Epoch(epochs[2].table[1:], time=epochs[2].time)
-    stars = ProperMotionFitter().fit(epochs).stars
-    assert np.flatnonzero(stars['flags'] & 1).tolist() == [0]
-    assert np.isnan(stars['pmra'][0])
-    assert np.isfinite(stars['pmra'][1:]).all()
-
-
-def test_two_epochs_give_motions_without_a_chi_square(rng):
-    epochs, _ = plane_epochs(rng, years=(2020.0, 2024.0))
-    stars = ProperMotionFitter(transform='shift').fit(epochs).stars
-    assert np.isfinite(stars['pmra_error']).all()
-    for name in ('chi2', 'dof', 'uwe'):
-        assert np.isnan(stars[name]).all()
-
+# What goes wrong
 
 def test_parallaxes_without_coverage_are_nan(scene):
     _, epochs = scene
@@ -535,61 +314,6 @@ def test_a_moving_reference_is_found_out(scene, quasars):
     assert line['flags'][0] & 32
     assert np.abs(pulls(line, truth)).max() < 5
     assert np.sum(fit.stars['flags'] & 32 > 0) < 3
-
-
-@pytest.mark.parametrize(('keywords', 'words'), [
-    ({'transform': 'banana'}, 'transform must be'),
-    ({'transform': 'poly-0'}, 'transform must be'),
-    ({'recipe': 'soup'}, 'recipe must be'),
-    ({'parallax': 'maybe'}, 'parallax must be'),
-    ({'systematic': 'some'}, 'systematic must be'),
-    ({'clip': -1}, 'clip must be'),
-    ({'match_by': 'eye'}, 'match_by must be'),
-    ({'hold_out': 2}, 'hold_out must be'),
-])
-def test_options_are_checked_when_they_are_given(keywords, words):
-    with pytest.raises(ValueError, match=words):
-        ProperMotionFitter(**keywords)
-
-
-@pytest.mark.parametrize(('keywords', 'words'), [
-    ({'match_radius': 1.0}, 'match_radius must be a Quantity'),
-    ({'systematic': 1.0}, 'systematic must be a Quantity'),
-    ({'executor': 3}, 'executor must be'),
-])
-def test_options_of_a_wrong_type_are_refused(keywords, words):
-    with pytest.raises(TypeError, match=words):
-        ProperMotionFitter(**keywords)
-
-
-def test_parallaxes_need_a_sky(rng):
-    epochs, _ = plane_epochs(rng)
-    with pytest.raises(ValueError, match='parallax must be False'):
-        ProperMotionFitter(parallax=True).fit(epochs)
-
-
-def test_an_epoch_without_stars_lacks_references(rng):
-    epochs = observe(make_truth(rng, n_stars=50, n_qso=50), rng)[:3]
-    empty = Epoch(epochs[2].table[:0], epochs[2].wcs, epochs[2].time)
-    with pytest.raises(ValueError, match='epoch 2 must have at least 3 '):
-        ProperMotionFitter(references='qso').fit([*epochs[:2], empty])
-
-
-@pytest.mark.parametrize(('keywords', 'kind', 'words'), [
-    ({'references': 3}, TypeError, 'references must be a table.*got 3'),
-    ({'ref_epoch': np.nan}, ValueError, 'ref_epoch must be finite'),
-    ({'ref_epoch': 57388.5}, ValueError, 'ref_epoch must be .*57388.5')])
-def test_what_is_found_out_in_the_fit_is_named(rng, keywords, kind, words):
-    with pytest.raises(kind, match=words):
-        ProperMotionFitter(**keywords).fit(plane_epochs(rng)[0])
-
-
-def test_a_single_epoch_is_refused(rng):
-    epochs, _ = plane_epochs(rng)
-    with pytest.raises(ValueError, match='at least 2'):
-        ProperMotionFitter().fit(epochs[:1])
-    with pytest.raises(TypeError, match='sequence of Epoch'):
-        ProperMotionFitter().fit(epochs[0])
 
 
 # The table
@@ -912,31 +636,3 @@ def test_times_of_single_rows_are_used(rng):
     assert_allclose(motion, 3.0, atol=0.02)
 
 
-def test_identifiers_of_other_stars_stop_the_fit(rng):
-    # The same numbers for different stars: nothing agrees.
-    epochs, _ = plane_epochs(rng, n=60, years=(2020.0, 2021.0, 2022.0))
-    mixed = [changed(epoch, id=rng.permutation(60)) for epoch in epochs]
-    with pytest.raises(ValueError, match='must agree with the others'):
-        ProperMotionFitter(transform='affine').fit(mixed)
-
-
-@pytest.mark.parametrize('transform', ['similarity', 'affine', 'poly-2'])
-def test_wrong_identifiers_of_half_the_stars_do_no_harm(rng, transform):
-    epochs, motion = plane_epochs(rng, n=100, years=(2020.0, 2022.0, 2024.0))
-    mixed = []
-    for epoch in epochs:
-        ids = np.arange(100)
-        ids[50:] = 50 + rng.permutation(50)
-        mixed.append(changed(epoch, id=ids))
-    fit = ProperMotionFitter(transform=transform, systematic=None).fit(mixed)
-    stars = fit.stars[fit.stars['id'] < 50]
-    design = np.column_stack([np.ones(50), stars['x'].value,
-                              stars['y'].value])
-    if transform == 'poly-2':
-        x, y = design[:, 1:].T
-        design = np.column_stack([design, x * x, x * y, y * y])
-    away = stars['pmra'].value - motion[0, stars['id']]
-    field = np.linalg.lstsq(design, away, rcond=None)[0]
-    assert rms(away - design @ field) < 0.01
-    wrong = fit.stars[fit.stars['id'] >= 50]
-    assert np.mean(wrong['flags'] & 512 > 0) > 0.9

@@ -12,9 +12,8 @@ from astropy.table import QTable
 from astropy.time import Time
 from astropy.wcs import WCS as FITSWCS
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.ndimage import label
+from photutils.psf import PSFPhotometry
 
-from photutils_mgauss._detector_effects import bleed, pattern
 from photutils_mgauss._simulation_bound import covariances
 from photutils_mgauss.gridded import GriddedMixturePSF
 from photutils_mgauss.mixture import GaussianMixture
@@ -202,8 +201,16 @@ def test_a_magnitude_is_the_flux_of_its_band():
                     'mag_g': [20.0] * u.mag, 'mag_r': [19.0] * u.mag})
     for band, mag in (('g', 20), ('r', 19)):
         scene = simulate(stars, Exposure(band=band), instrument=SMALL, rng=1)
-        assert_allclose(scene.truth['flux'].to_value(u.electron),
+        assert_allclose(scene.truth['flux'],
                         150 * CSST_BANDS[band].rate(mag))
+
+
+def test_a_true_flux_starts_photutils_as_it_is():
+    scene = simulate(one_star(50.2, 60.1, 1e5), instrument=SMALL, rng=1)
+    table = PSFPhotometry(scene.psf.local_model(50, 60), 7)(
+        scene.image - scene.background,
+        init_params=scene.truth['x', 'y', 'flux'])
+    assert_allclose(table['flux_fit'], 1e5, rtol=0.02)
 
 
 def test_sources_without_brightness_are_refused():
@@ -380,148 +387,6 @@ def test_a_distortion_of_higher_order_is_refused():
         Exposure(distortion=distortion)
 
 
-# Detector effects.
-
-def test_without_effects_nothing_is_flagged_and_a_pattern_is_flat():
-    scene = simulate(one_star(30, 40, 1e4), instrument=SMALL, rng=1)
-    assert not scene.mask.any()
-    fixed = pattern(DetectorEffects(), 3, slice(0, 50), 60)
-    assert_array_equal(fixed.response, 1)
-    assert_array_equal(fixed.dark, 0)
-
-
-def test_bad_pixels_belong_to_the_detector_not_to_the_exposure():
-    effects = DetectorEffects(hot_pixels=1e-3, dead_pixels=1e-3,
-                              bad_columns=2)
-    flags = [simulate(one_star(30, 40, 1e4), Exposure(detector=detector),
-                      instrument=SMALL, effects=effects, rng=rng).flags
-             for detector, rng in ((8, 1), (8, 2), (9, 1))]
-    assert_array_equal(flags[0], flags[1])
-    assert (flags[0] != flags[2]).any()
-    columns = (flags[0] & 16).any(axis=0)
-    assert columns.sum() == 2
-    assert (flags[0][:, columns] & 16).all()
-    n = flags[0].size * 1e-3
-    for bit in (4, 8):
-        assert abs(((flags[0] & bit) != 0).sum() - n) < 5 * np.sqrt(n)
-
-
-def test_hot_pixels_are_bright_and_dead_ones_and_bad_columns_dark():
-    camera = Instrument(shape=(300, 300), exposure_time=600)
-    effects = DetectorEffects(hot_pixels=2e-3, dead_pixels=2e-3,
-                              bad_columns=2)
-    scene = simulate(one_star(-50, -50, 0), instrument=camera,
-                     effects=effects, rng=1)
-    level = {bit: scene.image[scene.flags == bit].mean()
-             for bit in (4, 8, 16)}
-    assert level[4] > scene.background + 1000
-    assert abs(level[8] - 0.05 * scene.background) < 3
-    assert abs(level[16] - 0.4 * scene.background) < 3
-    good = scene.image[~scene.mask]
-    assert abs(good.mean() - scene.background) < 0.2
-
-
-def test_the_response_of_pixels_is_removed_but_its_noise_stays():
-    camera = Instrument(shape=(300, 300))
-    scene = simulate(one_star(-50, -50, 0), instrument=camera, rng=1,
-                     effects=DetectorEffects(prnu=0.3))
-    plain = simulate(one_star(-50, -50, 0), instrument=camera, rng=1)
-    assert_allclose(np.median(scene.image), scene.background, atol=0.7)
-    assert scene.image.std() > 1.05 * plain.image.std()
-    pulls = (scene.image - scene.background) / scene.error
-    assert_allclose(pulls.std(), 1, atol=0.05)
-
-
-def test_cosmic_rays_come_at_their_rate_and_are_flagged():
-    camera = Instrument(shape=(1000, 1000))
-    scene = simulate(one_star(-50, -50, 0), instrument=camera, rng=1,
-                     effects=DetectorEffects(cosmic_rays=2.0))
-    hit = (scene.flags & 2) != 0
-    tracks = label(hit, np.ones((3, 3)))[1]
-    assert abs(tracks - 300) < 5 * np.sqrt(300)
-    excess = scene.image - scene.background
-    assert excess[hit].sum() / 300 > 1000
-    assert excess[~hit].max() < 6 * scene.error.mean()
-
-
-def test_bleeding_conserves_charge_and_stays_in_the_column():
-    rng = np.random.default_rng(4)
-    electrons = rng.uniform(0, 50, (80, 30)).astype(np.float32)
-    before = electrons.copy()
-    electrons[40, 7] = 1200
-    electrons[41, 7] = 900
-    electrons[60, 20] = 333
-    expected = electrons.sum(axis=0, dtype=float)
-    bleed(electrons, 100.0)
-    assert_allclose(electrons.sum(axis=0, dtype=float), expected, rtol=1e-6)
-    assert electrons.max() <= 100
-    still = np.ones(30, bool)
-    still[[7, 20]] = False
-    assert_array_equal(electrons[:, still], before[:, still])
-    full = np.flatnonzero(electrons[:, 7] == 100)
-    assert_array_equal(full, np.arange(full[0], full[-1] + 1))
-    assert abs(full.mean() - 40.5) <= 1.5
-
-
-def test_charge_that_reaches_the_end_of_a_column_is_lost():
-    electrons = np.full((10, 1), 90, np.float32)
-    electrons[5] = 1e4
-    bleed(electrons, 100.0)
-    assert_array_equal(electrons, 100)
-
-
-def test_a_saturated_star_bleeds_up_and_down():
-    scene = simulate(one_star(150, 100, 5e6), instrument=SMALL, rng=1,
-                     effects=DetectorEffects(bleeding=True))
-    rows, columns = np.nonzero(scene.mask)
-    assert np.ptp(rows) > 3 * np.ptp(columns)
-    assert scene.image.max() < SMALL.full_well + 50
-    light = (scene.image - scene.background).sum()
-    assert_allclose(light, 5e6, rtol=2e-3)
-
-
-def test_nonlinearity_takes_its_share_at_the_full_well():
-    star = one_star(150, 100, 4e5)
-    scenes = [simulate(star, instrument=SMALL, rng=1,
-                       effects=DetectorEffects(nonlinearity=loss))
-              for loss in (0, 0.05)]
-    charge = scenes[0].image[100, 150]
-    lost = 1 - scenes[1].image[100, 150] / charge
-    assert charge > 0.5 * SMALL.full_well
-    assert_allclose(lost, 0.05 * charge / SMALL.full_well, rtol=0.05)
-
-
-def test_charge_diffusion_widens_the_true_psf():
-    star = one_star(150, 100, 1e4)
-    plain = simulate(star, instrument=SMALL, rng=1)
-    wide = simulate(star, instrument=SMALL, rng=1,
-                    effects=DetectorEffects(charge_diffusion=0.5))
-    gain = (wide.psf.mixture_at(9, 9).moments().covariance
-            - plain.psf.mixture_at(9, 9).moments().covariance)
-    assert_allclose(gain, 0.25 * np.eye(2), atol=1e-12)
-    assert wide.image.max() < plain.image.max()
-
-
-def test_all_effects_together_do_not_depend_on_threads():
-    camera = Instrument(shape=(300, 200))
-    stars = crowded_field(camera.shape, rng=1)
-    with ThreadPoolExecutor(1) as pool:
-        one, many = (simulate(stars, instrument=camera, rng=7,
-                              effects=DetectorEffects.typical(), executor=e)
-                     for e in (pool, None))
-    assert_array_equal(one.image, many.image)
-    assert_array_equal(one.error, many.error)
-    assert_array_equal(one.flags, many.flags)
-
-
-@pytest.mark.parametrize(('name', 'value'), [
-    ('prnu', -0.1), ('hot_pixels', 2), ('cosmic_rays', -1),
-    ('bad_columns', -1)])
-def test_effects_of_nonsense_are_refused(name, value):
-    with pytest.raises(ValueError, match=f'{name} must be at'):
-        DetectorEffects(**{name: value})
-
-
 # Files.
 
 @pytest.fixture(scope='module')
@@ -543,6 +408,7 @@ def test_a_scene_is_read_back_from_extensions(small_scene, tmp_path):
     truth = QTable.read(paths[1])
     assert_allclose(truth['x'].value, small_scene.truth['x'].value)
     assert truth['pmra'].unit == u.mas / u.yr
+    assert truth['flux'].unit == header['BUNIT'] == u.electron
     x, y = truth['x'].value, truth['y'].value
     ra, dec = small_scene.wcs(x, y, with_bounding_box=False)
     with asdf.open(paths[2]) as file:

@@ -23,11 +23,9 @@ scene = simulate(sparse_field(camera.shape, rng=1, psf_fraction=0.1,
                               magnitudes=(18, 24.5)),
                  instrument=camera, psf=psf, rng=2)
 stars = scene.truth[scene.truth['inside']]
-start = stars['x', 'y', 'flux']
-start['flux'] = start['flux'].value
 table = MixturePSFPhotometry(psf, (11, 11), aperture_radius=3)(
     scene.image - scene.background, error=scene.error, mask=scene.mask,
-    init_params=start)
+    init_params=stars['x', 'y', 'flux'])
 
 mas = 1e3 * camera.pixel_scale
 residuals = mas * np.column_stack([table[f'{c}_fit'] - stars[c].value

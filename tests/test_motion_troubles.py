@@ -1,0 +1,189 @@
+"""Motions of what cannot be fitted: an error, or a flag for one star."""
+import numpy as np
+import pytest
+from astropy.table import Table
+from motion_scenes import changed, make_truth, observe, plane_epochs, rms
+from numpy.testing import assert_allclose
+
+from photutils_mgauss import Epoch, ProperMotionFitter, decode_motion_flags
+
+
+def test_epochs_without_common_stars_raise(rng):
+    epochs, _ = plane_epochs(rng)
+    epochs = [changed(epoch, id=epoch.table['id'] + 100 * k)
+              for k, epoch in enumerate(epochs)]
+    with pytest.raises(ValueError, match='epochs must have stars in common'):
+        ProperMotionFitter().fit(epochs)
+
+
+def test_no_time_baseline_raises(rng):
+    epochs, _ = plane_epochs(rng, years=(2020.0, 2020.0))
+    with pytest.raises(ValueError, match='time baseline'):
+        ProperMotionFitter().fit(epochs)
+
+
+def test_exposures_of_one_time_are_data(rng):
+    epochs, _ = plane_epochs(rng, years=(2020.0, 2020.0, 2024.0, 2024.0))
+    fit = ProperMotionFitter(transform='shift', systematic=None).fit(epochs)
+    # Two exposures at each end halve the variance of one.
+    assert_allclose(np.median(fit.stars['pmra_error'].value), 0.01 / 4,
+                    rtol=0.02)
+    assert (fit.stars['flags'] & 1 == 0).all()
+
+
+@pytest.mark.parametrize(('transform', 'n'), [
+    ('shift', 0), ('similarity', 1), ('affine', 2), ('poly-2', 5)])
+def test_too_few_references_raise(rng, transform, n):
+    epochs, _ = plane_epochs(rng)
+    marked = [changed(epoch, qso=np.arange(40) < max(n, 1))
+              for epoch in epochs]
+    if n == 0:
+        marked[1] = changed(marked[1], x_err=np.where(
+            marked[1].table['qso'], np.nan, 0.01))
+    with pytest.raises(ValueError, match=f'got {n}$'):
+        ProperMotionFitter(transform=transform, references='qso').fit(marked)
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
+def test_a_position_that_is_not_finite_is_flagged(rng, value):
+    epochs, _ = plane_epochs(rng)
+    clean = ProperMotionFitter(systematic=None).fit(epochs)
+    epochs[1].table['x_fit'][3] = value
+    fit = ProperMotionFitter(systematic=None).fit(epochs)
+    assert [words.split(':')[0] for words in decode_motion_flags(
+        fit.stars['flags'][3])] == ['bad_position', 'relative']
+    assert fit.stars['n_good_obs'][3] == 2
+    assert np.isfinite(fit.stars['pmra']).all()
+    others = np.arange(40) != 3
+    assert_allclose(fit.stars['pmra'][others].value,
+                    clean.stars['pmra'][others].value, atol=0.003)
+
+
+def test_a_masked_position_is_flagged(rng):
+    epochs, _ = plane_epochs(rng)
+    table = Table(epochs[1].table, masked=True)
+    table['y_fit'].mask[5] = True
+    epochs[1] = Epoch(table, time=epochs[1].time)
+    stars = ProperMotionFitter().fit(epochs).stars
+    assert np.flatnonzero(stars['flags'] & 4).tolist() == [5]
+
+
+@pytest.mark.parametrize('error', [0.0, -1.0, np.nan, np.inf])
+def test_an_error_that_is_not_positive_has_no_weight(rng, error):
+    epochs, _ = plane_epochs(rng)
+    epochs[2].table['y_err'][7] = error
+    stars = ProperMotionFitter().fit(epochs).stars
+    assert np.flatnonzero(stars['flags'] & 2).tolist() == [7]
+    assert stars['n_good_obs'][7] == 2
+    assert stars['n_obs'][7] == 3
+
+
+def test_a_singular_covariance_has_no_weight(rng):
+    epochs, _ = plane_epochs(rng)
+    epochs = [changed(epoch, xy_cov=np.zeros(40)) for epoch in epochs]
+    epochs[0].table['xy_cov'][2] = 0.01**2
+    stars = ProperMotionFitter().fit(epochs).stars
+    assert np.flatnonzero(stars['flags'] & 2).tolist() == [2]
+
+
+def test_a_star_seen_once_is_nan_and_flagged(rng):
+    epochs, _ = plane_epochs(rng)
+    epochs[1] = Epoch(epochs[1].table[1:], time=epochs[1].time)
+    epochs[2] = Epoch(epochs[2].table[1:], time=epochs[2].time)
+    stars = ProperMotionFitter().fit(epochs).stars
+    assert np.flatnonzero(stars['flags'] & 1).tolist() == [0]
+    assert np.isnan(stars['pmra'][0])
+    assert np.isfinite(stars['pmra'][1:]).all()
+
+
+def test_two_epochs_give_motions_without_a_chi_square(rng):
+    epochs, _ = plane_epochs(rng, years=(2020.0, 2024.0))
+    stars = ProperMotionFitter(transform='shift').fit(epochs).stars
+    assert np.isfinite(stars['pmra_error']).all()
+    for name in ('chi2', 'dof', 'uwe'):
+        assert np.isnan(stars[name]).all()
+
+
+@pytest.mark.parametrize(('keywords', 'words'), [
+    ({'transform': 'banana'}, 'transform must be'),
+    ({'transform': 'poly-0'}, 'transform must be'),
+    ({'recipe': 'soup'}, 'recipe must be'),
+    ({'parallax': 'maybe'}, 'parallax must be'),
+    ({'systematic': 'some'}, 'systematic must be'),
+    ({'clip': -1}, 'clip must be'),
+    ({'match_by': 'eye'}, 'match_by must be'),
+    ({'hold_out': 2}, 'hold_out must be'),
+])
+def test_options_are_checked_when_they_are_given(keywords, words):
+    with pytest.raises(ValueError, match=words):
+        ProperMotionFitter(**keywords)
+
+
+@pytest.mark.parametrize(('keywords', 'words'), [
+    ({'match_radius': 1.0}, 'match_radius must be a Quantity'),
+    ({'systematic': 1.0}, 'systematic must be a Quantity'),
+    ({'executor': 3}, 'executor must be'),
+])
+def test_options_of_a_wrong_type_are_refused(keywords, words):
+    with pytest.raises(TypeError, match=words):
+        ProperMotionFitter(**keywords)
+
+
+def test_parallaxes_need_a_sky(rng):
+    epochs, _ = plane_epochs(rng)
+    with pytest.raises(ValueError, match='parallax must be False'):
+        ProperMotionFitter(parallax=True).fit(epochs)
+
+
+def test_an_epoch_without_stars_lacks_references(rng):
+    epochs = observe(make_truth(rng, n_stars=50, n_qso=50), rng)[:3]
+    empty = Epoch(epochs[2].table[:0], epochs[2].wcs, epochs[2].time)
+    with pytest.raises(ValueError, match='epoch 2 must have at least 3 '):
+        ProperMotionFitter(references='qso').fit([*epochs[:2], empty])
+
+
+@pytest.mark.parametrize(('keywords', 'kind', 'words'), [
+    ({'references': 3}, TypeError, 'references must be a table.*got 3'),
+    ({'ref_epoch': np.nan}, ValueError, 'ref_epoch must be finite'),
+    ({'ref_epoch': 57388.5}, ValueError, 'ref_epoch must be .*57388.5')])
+def test_what_is_found_out_in_the_fit_is_named(rng, keywords, kind, words):
+    with pytest.raises(kind, match=words):
+        ProperMotionFitter(**keywords).fit(plane_epochs(rng)[0])
+
+
+def test_a_single_epoch_is_refused(rng):
+    epochs, _ = plane_epochs(rng)
+    with pytest.raises(ValueError, match='at least 2'):
+        ProperMotionFitter().fit(epochs[:1])
+    with pytest.raises(TypeError, match='sequence of Epoch'):
+        ProperMotionFitter().fit(epochs[0])
+
+
+def test_identifiers_of_other_stars_stop_the_fit(rng):
+    # The same numbers for different stars: nothing agrees.
+    epochs, _ = plane_epochs(rng, n=60, years=(2020.0, 2021.0, 2022.0))
+    mixed = [changed(epoch, id=rng.permutation(60)) for epoch in epochs]
+    with pytest.raises(ValueError, match='must agree with the others'):
+        ProperMotionFitter(transform='affine').fit(mixed)
+
+
+@pytest.mark.parametrize('transform', ['similarity', 'affine', 'poly-2'])
+def test_wrong_identifiers_of_half_the_stars_do_no_harm(rng, transform):
+    epochs, motion = plane_epochs(rng, n=100, years=(2020.0, 2022.0, 2024.0))
+    mixed = []
+    for epoch in epochs:
+        ids = np.arange(100)
+        ids[50:] = 50 + rng.permutation(50)
+        mixed.append(changed(epoch, id=ids))
+    fit = ProperMotionFitter(transform=transform, systematic=None).fit(mixed)
+    stars = fit.stars[fit.stars['id'] < 50]
+    design = np.column_stack([np.ones(50), stars['x'].value,
+                              stars['y'].value])
+    if transform == 'poly-2':
+        x, y = design[:, 1:].T
+        design = np.column_stack([design, x * x, x * y, y * y])
+    away = stars['pmra'].value - motion[0, stars['id']]
+    field = np.linalg.lstsq(design, away, rcond=None)[0]
+    assert rms(away - design @ field) < 0.01
+    wrong = fit.stars[fit.stars['id'] >= 50]
+    assert np.mean(wrong['flags'] & 512 > 0) > 0.9
