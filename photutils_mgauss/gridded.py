@@ -309,6 +309,11 @@ n_components=1)>
         Returns
         -------
         GriddedMixturePSF or dict of them
+
+        Raises
+        ------
+        TypeError
+            If the field is not a `MixtureField`.
         """
         if isinstance(field, Mapping):
             return {name: cls.from_field(one, grid_shape=grid_shape)
