@@ -345,9 +345,13 @@ def _named_references(references, names, matches, epochs):
     if isinstance(references, str):
         marked = np.zeros(len(names), dtype=bool)
         for epoch, rows in zip(epochs, matches.rows, strict=True):
-            mask = _marked(epoch.table, references)
-            marked |= (rows >= 0) & mask[rows]
+            seen = rows >= 0
+            marked[seen] |= _marked(epoch.table, references)[rows[seen]]
         return np.flatnonzero(marked)
+    if not np.iterable(references):
+        msg = ('references must be a table, identifiers, or the name of a '
+               f'column of every epoch, got {references!r}')
+        raise TypeError(msg)
     return _lookup(list(references), names)
 
 

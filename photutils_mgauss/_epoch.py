@@ -174,7 +174,10 @@ def _check_columns(table, is_pixels):
               else ('ra', 'dec', 'ra_err', 'dec_err'))
     for key in wanted:
         if find_column(table, key) is None:
-            words = ' or '.join(repr(name) for name in COLUMNS[key])
+            names = COLUMNS[key]
+            if key == 'ra':  # The table has no positions of either kind.
+                names = (*COLUMNS['x'], *names)
+            words = ' or '.join(repr(name) for name in names)
             msg = f'table must have a column {words}, got {table.colnames}'
             raise ValueError(msg)
 
@@ -252,7 +255,8 @@ def numbers(table, key, unit=None):
             raise ValueError(msg) from error
         return np.array(column.value, dtype=float)
     try:
-        return np.ma.filled(np.ma.asarray(column, dtype=float), np.nan)
+        return np.ma.filled(np.ma.asarray(getattr(column, 'value', column),
+                                          dtype=float), np.nan)
     except (TypeError, ValueError) as error:
         msg = f'column {name!r} must hold numbers'
         raise TypeError(msg) from error

@@ -880,75 +880,130 @@ FIT_CONVERGED, FIT_STOPPED = range(2)
 
 
 @_jit
-def draw_unit(shapes, cx, cy, images):
-    """Put Gaussians of unit flux into images (K, ny, nx)."""
+def draw_unit(shapes, cx, cy, lanes, images):
+    """
+    Put Gaussians of unit flux into images (K, ny, nx).
+
+    lanes (4, nx) is scratch.
+    """
     for k in range(shapes.shape[0]):
-        mx, my, log_l, t, log_m = shapes[k]
-        length, m = exp(log_l), exp(log_m)
-        peak = exp(log_l + log_m - _LOG_2PI)
-        for j in range(images.shape[1]):
-            row = images[k, j]
-            row[:] = 0.0
-            v = j - cy - my
-            q = m * m * v * v
-            if q < _LOG_NOTHING:
-                _add_row(peak * exp(-0.5 * q), -cx - mx + t / length * v,
-                         length * length, row)
+        if _is_steep(shapes[k], cx, cy, images[k].shape):
+            _draw_by_rows(shapes[k], cx, cy, images[k])
+        else:
+            _draw_by_columns(shapes[k], cx, cy, lanes, images[k])
+
+
+# Exponents within this keep their exponential, and its inverse, a number.
+_STEEP = 600.0
+
+
+@_jit
+def _is_steep(shape, cx, cy, size):
+    """
+    Return whether a walk along columns leaves the range of numbers.
+
+    It starts near the row of the mean, where a thin, tilted Gaussian may be
+    0 in columns that it reaches elsewhere, or change too much to the next.
+    """
+    mx, my, log_l, t, log_m = shape
+    length, m = exp(log_l), exp(log_m)
+    v = min(max(np.rint(cy + my), 0.0), size[0] - 1.0) - cy - my
+    far = length * max(abs(cx + mx), abs(size[1] - 1 - cx - mx)) + abs(t * v)
+    slope, square = abs(t) * far + m * m * abs(v), far * far + m * m * v * v
+    # So written, what is not a number is steep.
+    return not (slope <= _STEEP
+                and (abs(t) <= m or square <= 2 * _STEEP))
+
+
+@_jit
+def _draw_by_rows(shape, cx, cy, image):
+    mx, my, log_l, t, log_m = shape
+    length, m = exp(log_l), exp(log_m)
+    peak = exp(log_l + log_m - _LOG_2PI)
+    for j in range(image.shape[0]):
+        row = image[j]
+        row[:] = 0.0
+        v = j - cy - my
+        q = m * m * v * v
+        if q < _LOG_NOTHING:
+            _add_row(peak * exp(-0.5 * q), -cx - mx + t / length * v,
+                     length * length, row)
+
+
+@_jit
+def _draw_by_columns(shape, cx, cy, lanes, image):
+    """
+    Draw all columns at once, from the row of the mean up and down.
+
+    The quotient of a pixel and the next of its column changes by the same
+    factor each row, so a pixel costs two multiplications.
+    """
+    mx, my, log_l, t, log_m = shape
+    length, m = exp(log_l), exp(log_m)
+    peak = exp(log_l + log_m - _LOG_2PI)
+    start = min(max(int(np.rint(cy + my)), 0), image.shape[0] - 1)
+    v = start - cy - my
+    b = m * v
+    bend = t * t + m * m
+    half, fall = exp(-0.5 * bend), exp(-bend)
+    upper, up, lower, down = lanes[0], lanes[1], lanes[2], lanes[3]
+    a = t * v - length * (cx + mx)
+    for i in range(upper.size):
+        square = (length * i + a) * (length * i + a) + b * b
+        upper[i] = peak * _exp(-0.5 * square)
+    turn = exp(-length * t)
+    up[0], down[0] = half * exp(-a * t - m * b), half * exp(a * t + m * b)
+    for i in range(1, upper.size):
+        up[i], down[i] = up[i - 1] * turn, down[i - 1] / turn
+    for i in range(upper.size):
+        lower[i] = upper[i] * down[i]
+        down[i] *= fall
+    _walk_columns(start, image.shape[0], 1, fall, upper, up, image)
+    _walk_columns(start - 1, -1, -1, fall, lower, down, image)
+
+
+@_jit
+def _walk_columns(start, end, way, fall, value, quotient, image):
+    """Put value (nx,) into rows start, start + way, ... before end."""
+    for j in range(start, end, way):
+        row = image[j]
+        for i in range(value.size):
+            row[i] = value[i]
+            following = value[i] * quotient[i]
+            value[i] = following if following > _NOTHING else 0.0
+            quotient[i] *= fall
 
 
 @_jit
 def _columns_of_product(a, b, weight, cy, columns):
-    """
-    Put sum_y w a b y^m into columns[m, x], m <= 4.
-
-    Four columns at a time with sums of their own: the compiler packs them
-    into vectors, which it must not do to a single sum.
-    """
+    """Put sum_y w a b y^m into columns[m, x], m <= 4."""
     ny, nx = a.shape
-    blocks = nx - nx % 4
-    for i in range(0, blocks, 4):
-        p0, p1, p2, p3 = 0.0, 0.0, 0.0, 0.0
-        q0, q1, q2, q3 = 0.0, 0.0, 0.0, 0.0
-        r0, r1, r2, r3 = 0.0, 0.0, 0.0, 0.0
-        s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
-        t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
-        for j in range(ny):
-            v = j - cy
-            h0 = weight[j, i] * a[j, i] * b[j, i]
-            h1 = weight[j, i + 1] * a[j, i + 1] * b[j, i + 1]
-            h2 = weight[j, i + 2] * a[j, i + 2] * b[j, i + 2]
-            h3 = weight[j, i + 3] * a[j, i + 3] * b[j, i + 3]
-            p0, p1, p2, p3 = p0 + h0, p1 + h1, p2 + h2, p3 + h3
-            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
-            q0, q1, q2, q3 = q0 + h0, q1 + h1, q2 + h2, q3 + h3
-            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
-            r0, r1, r2, r3 = r0 + h0, r1 + h1, r2 + h2, r3 + h3
-            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
-            s0, s1, s2, s3 = s0 + h0, s1 + h1, s2 + h2, s3 + h3
-            h0, h1, h2, h3 = h0 * v, h1 * v, h2 * v, h3 * v
-            t0, t1, t2, t3 = t0 + h0, t1 + h1, t2 + h2, t3 + h3
-        _put(columns[0], i, p0, p1, p2, p3)
-        _put(columns[1], i, q0, q1, q2, q3)
-        _put(columns[2], i, r0, r1, r2, r3)
-        _put(columns[3], i, s0, s1, s2, s3)
-        _put(columns[4], i, t0, t1, t2, t3)
-    for i in range(blocks, nx):
-        p, q, r, s, t = 0.0, 0.0, 0.0, 0.0, 0.0
-        for j in range(ny):
-            v = j - cy
-            h = weight[j, i] * a[j, i] * b[j, i]
-            p += h
-            q += h * v
-            r += h * v * v
-            s += h * v * v * v
-            t += h * v * v * v * v
-        columns[0, i], columns[1, i], columns[2, i] = p, q, r
-        columns[3, i], columns[4, i] = s, t
-
-
-@_jit
-def _put(row, i, a, b, c, d):
-    row[i], row[i + 1], row[i + 2], row[i + 3] = a, b, c, d
+    columns[:] = 0.0
+    c0, c1, c2 = columns[0], columns[1], columns[2]
+    c3, c4 = columns[3], columns[4]
+    # Two rows at once: a sum is loaded and stored half as often.
+    for j in range(0, ny - 1, 2):
+        v, z = j - cy, j + 1 - cy
+        for i in range(nx):
+            g = weight[j, i] * a[j, i] * b[j, i]
+            h = weight[j + 1, i] * a[j + 1, i] * b[j + 1, i]
+            c0[i] += g + h
+            g, h = g * v, h * z
+            c1[i] += g + h
+            g, h = g * v, h * z
+            c2[i] += g + h
+            g, h = g * v, h * z
+            c3[i] += g + h
+            c4[i] += g * v + h * z
+    if ny % 2:
+        v = ny - 1 - cy
+        for i in range(c0.size):
+            g = weight[ny - 1, i] * a[ny - 1, i] * b[ny - 1, i]
+            c0[i] += g
+            c1[i] += g * v
+            c2[i] += g * (v * v)
+            c3[i] += g * (v * v * v)
+            c4[i] += g * (v * v * v * v)
 
 
 @_jit
@@ -978,6 +1033,32 @@ def _moments_of_product(a, b, weight, cx, cy, columns, out):
     out[1, 0], out[1, 1], out[1, 2], out[1, 3] = b0, b1, b2, b3
     out[2, 0], out[2, 1], out[2, 2] = c0, c1, c2
     out[3, 0], out[3, 1], out[4, 0] = d0, d1, e0
+
+
+@_jit
+def _low_moments(a, b, centre, columns, sums):
+    """
+    Put sum_pixels a b (1, x, y, xx, xy, yy) into sums (6,).
+
+    columns (at least 3, nx) is scratch.
+    """
+    c0, c1, c2 = columns[0], columns[1], columns[2]
+    c0[:], c1[:], c2[:] = 0.0, 0.0, 0.0
+    for j in range(a.shape[0]):
+        v = j - centre[1]
+        v2 = v * v
+        for i in range(c0.size):
+            h = a[j, i] * b[j, i]
+            c0[i] += h
+            c1[i] += h * v
+            c2[i] += h * v2
+    s0, s1, s2, s3, s4, s5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(c0.size):
+        x = i - centre[0]
+        s0, s1, s2 = s0 + c0[i], s1 + x * c0[i], s2 + c1[i]
+        s3, s4, s5 = s3 + x * x * c0[i], s4 + x * c1[i], s5 + c2[i]
+    sums[0], sums[1], sums[2] = s0, s1, s2
+    sums[3], sums[4], sums[5] = s3, s4, s5
 
 
 @_jit
@@ -1124,10 +1205,6 @@ def _steepest(gram, rhs, active, x):
 @_jit
 def _solve_fluxes(gram, rhs, signed, x, active, work):
     """
-    Solve min |G x - z| given gram = G^T G and rhs = G^T z.
-
-    Unless signed, x >= 0: Lawson and Hanson's active set, started from all
-    unknowns free. work is (n, n + 1).
     Solve min |G x - z| with x >= 0, unless signed.
 
     gram is G^T G, rhs G^T z. Lawson and Hanson's active set, started from
@@ -1230,44 +1307,59 @@ def project(stamp, weight, centre, shapes, tie, signed, rows, fluxes,
     (m, ny, nx) are sums over the residual whose squares count too; m may be
     0. The images and the residual are left in scratch.
     """
-    images, residual, gram, rhs, work, active = scratch[:6]
+    images, residual, _, gram, rhs, work, active, lanes = scratch[:8]
     total, tie_weight = tie
-    draw_unit(shapes, centre[0], centre[1], images)
+    draw_unit(shapes, centre[0], centre[1], lanes[:4], images)
     n = fluxes.size
     for k in range(n):
-        rhs[k] = _weighted_dot(images[k], stamp, weight) + tie_weight * total
+        rhs[k] = (_weighted_dot(images[k], stamp, weight, lanes[0])
+                  + tie_weight * total)
         for other in range(k + 1):
-            dot = _weighted_dot(images[k], images[other], weight) + tie_weight
-            gram[k, other] = gram[other, k] = dot
+            gram[k, other] = tie_weight + _weighted_dot(
+                images[k], images[other], weight, lanes[0])
+            gram[other, k] = gram[k, other]
     if rows.shape[0] > 0:
-        _add_rows_to_fluxes(rows, stamp, images, gram, rhs)
+        _add_rows_to_fluxes(rows, stamp, images, lanes[0], gram, rhs)
     _solve_fluxes(gram, rhs, signed, fluxes, active, work)
     _residual(stamp, images, fluxes, residual)
-    chi2 = _weighted_dot(residual, residual, weight)
+    chi2 = _weighted_dot(residual, residual, weight, lanes[0])
     for row in rows:
-        chi2 += _dot(row, residual) ** 2
+        chi2 += _dot(row, residual, lanes[0]) ** 2
     lack = fluxes.sum() - total
     return chi2 + tie_weight * lack * lack
 
 
+# Sums over pixels are taken column by column first: the compiler makes
+# vectors of such sums, which it must not of a single one.
+
 @_jit
-def _dot(a, b):
-    """Return sum_pixels a b."""
-    total = 0.0
+def _weighted_dot(a, b, weight, lane):
+    """Return sum_pixels w a b; lane (nx,) is scratch."""
+    lane[:] = 0.0
     for j in range(a.shape[0]):
-        for i in range(a.shape[1]):
-            total += a[j, i] * b[j, i]
-    return total
+        for i in range(lane.size):
+            lane[i] += weight[j, i] * a[j, i] * b[j, i]
+    return lane.sum()
 
 
 @_jit
-def _add_rows_to_fluxes(rows, stamp, images, gram, rhs):
+def _dot(a, b, lane):
+    """Return sum_pixels a b; lane (nx,) is scratch."""
+    lane[:] = 0.0
+    for j in range(a.shape[0]):
+        for i in range(lane.size):
+            lane[i] += a[j, i] * b[j, i]
+    return lane.sum()
+
+
+@_jit
+def _add_rows_to_fluxes(rows, stamp, images, lane, gram, rhs):
     """Add rows (m, ny, nx) over the residual to the equations of fluxes."""
     seen = np.empty(images.shape[0])
     for row in rows:
-        want = _dot(row, stamp)
+        want = _dot(row, stamp, lane)
         for k in range(seen.size):
-            seen[k] = _dot(row, images[k])
+            seen[k] = _dot(row, images[k], lane)
         for k in range(seen.size):
             rhs[k] += seen[k] * want
             for other in range(seen.size):
@@ -1275,20 +1367,16 @@ def _add_rows_to_fluxes(rows, stamp, images, gram, rhs):
 
 
 @_jit
-def _add_rows(rows, centre, residual, images, fluxes, polynomials, matrix,
-              gradient):
+def _add_rows(rows, centre, residual, images, fluxes, polynomials, columns,
+              matrix, gradient):
     """Add rows (m, ny, nx) over the residual to the normal equations."""
     n = fluxes.size
     sums, slopes = np.empty(6), np.empty(6 * n)
     for row in rows:
-        left = _dot(row, residual)
+        left = _dot(row, residual, columns[0])
         for k in range(n):
-            _row_moments(row, images[k], centre, sums)
-            for i in range(6):
-                slope = 0.0
-                for a in range(6):
-                    slope += polynomials[k, i, a] * sums[a]
-                slopes[_unknown(n, k, i)] = slope * (fluxes[k] if i else 1.0)
+            _low_moments(row, images[k], centre, columns, sums)
+            _put_slopes(polynomials[k], sums, k, fluxes, slopes)
         for i in range(6 * n):
             gradient[i] += slopes[i] * left
             for j in range(6 * n):
@@ -1296,40 +1384,13 @@ def _add_rows(rows, centre, residual, images, fluxes, polynomials, matrix,
 
 
 @_jit
-def _row_moments(row, image, centre, sums):
-    """Put sum_pixels row image (1, x, y, xx, xy, yy) into sums (6,)."""
-    sums[:] = 0.0
-    for j in range(image.shape[0]):
-        s0, s1, s2 = 0.0, 0.0, 0.0
-        for i in range(image.shape[1]):
-            h = row[j, i] * image[j, i]
-            x = i - centre[0]
-            s0 += h
-            s1 += h * x
-            s2 += h * x * x
-        y = j - centre[1]
-        sums[0] += s0
-        sums[1] += s1
-        sums[2] += y * s0
-        sums[3] += s2
-        sums[4] += y * s1
-        sums[5] += y * y * s0
-
-
-@_jit
-def _weighted_dot(a, b, weight):
-    """Return sum_pixels w a b, in four sums that make a vector."""
-    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
-    blocks = a.shape[1] - a.shape[1] % 4
-    for j in range(a.shape[0]):
-        for i in range(0, blocks, 4):
-            s0 += weight[j, i] * a[j, i] * b[j, i]
-            s1 += weight[j, i + 1] * a[j, i + 1] * b[j, i + 1]
-            s2 += weight[j, i + 2] * a[j, i + 2] * b[j, i + 2]
-            s3 += weight[j, i + 3] * a[j, i + 3] * b[j, i + 3]
-        for i in range(blocks, a.shape[1]):
-            s0 += weight[j, i] * a[j, i] * b[j, i]
-    return s0 + s1 + s2 + s3
+def _put_slopes(polynomials, sums, k, fluxes, slopes):
+    """Put the slopes by the numbers of Gaussian k into slopes (6K,)."""
+    for i in range(6):
+        slope = 0.0
+        for a in range(6):
+            slope += polynomials[i, a] * sums[a]
+        slopes[_unknown(fluxes.size, k, i)] = slope * (fluxes[k] if i else 1.0)
 
 
 @_jit
@@ -1341,19 +1402,16 @@ def normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
     The unknowns are the K fluxes and five shape numbers for each Gaussian.
     The images and the residual come from `project`.
     """
-    images, residual = scratch[:2]
-    polynomials, columns, moments, half, block = scratch[6:]
+    images, residual, weighted = scratch[:3]
+    columns, polynomials, sums, moments, half, block = scratch[7:]
     n = fluxes.size
+    for j in range(weight.shape[0]):
+        for i in range(weight.shape[1]):
+            weighted[j, i] = weight[j, i] * residual[j, i]
     for k in range(n):
         _polynomials(shapes[k], polynomials[k])
-        _moments_of_product(images[k], residual, weight, centre[0], centre[1],
-                            columns, moments)
-        for i in range(6):
-            slope = 0.0
-            for a in range(6):
-                slope += (polynomials[k, i, a]
-                          * moments[_POWER_X[a], _POWER_Y[a]])
-            gradient[_unknown(n, k, i)] = slope * (fluxes[k] if i else 1.0)
+        _low_moments(images[k], weighted, centre, columns, sums)
+        _put_slopes(polynomials[k], sums, k, fluxes, gradient)
     for k in range(n):
         for other in range(k + 1):
             _moments_of_product(images[k], images[other], weight, centre[0],
@@ -1364,8 +1422,8 @@ def normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
             matrix[k, other] += tie[1]
             matrix[other, k] = matrix[k, other]
     if rows.shape[0] > 0:
-        _add_rows(rows, centre, residual, images, fluxes, polynomials, matrix,
-                  gradient)
+        _add_rows(rows, centre, residual, images, fluxes, polynomials,
+                  columns, matrix, gradient)
 
 
 @_jit
@@ -1501,8 +1559,9 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed, rows,
     idle_matrix, idle_gradient = factor, step
     cost = project(stamp, weight, centre, shapes, tie, signed, rows, fluxes,
                    scratch)
-    normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
-                     matrix, gradient)
+    if max_steps > 0:
+        normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
+                         matrix, gradient)
     cost += add_penalties(shapes, limits, matrix, gradient)
     damping, growth, small = 1e-2, 2.0, 0
     for n_steps in range(1, max_steps + 1):
@@ -1522,17 +1581,35 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed, rows,
         drop = cost - trial_cost
         shapes[:] = trial
         fluxes[:] = trial_fluxes
-        normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
-                         matrix, gradient)
-        add_penalties(shapes, limits, matrix, gradient)
         small = small + 1 if drop <= tolerance * cost else 0
         cost = trial_cost
         if small >= 2:
             return cost, FIT_CONVERGED, n_steps
+        if n_steps == max_steps:
+            break
+        normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
+                         matrix, gradient)
+        add_penalties(shapes, limits, matrix, gradient)
         quality = 2 * drop / max(gain, 1e-300) - 1
         damping = max(damping * max(0.2, 1 - quality ** 3), 1e-15)
         growth = 2.0
     return cost, FIT_STOPPED, max_steps
+
+
+@_jit
+def fit_starts(stamp, weight, centre, shapes, fluxes, tie, signed, rows,
+               fixed_means, limits, tolerance, max_steps, scratch, matrices,
+               vectors, costs, statuses):
+    """
+    Do `fit_shapes` from each of several starts, in place.
+
+    shapes is (n, K, 5), fluxes (n, K); costs and statuses (n,) are written.
+    """
+    for i in range(costs.size):
+        costs[i], statuses[i], _ = fit_shapes(
+            stamp, weight, centre, shapes[i], fluxes[i], tie, signed, rows,
+            fixed_means, limits, tolerance, max_steps, scratch, matrices,
+            vectors)
 
 
 @_jit

@@ -89,6 +89,9 @@ def of_gridded_psf(psf):
     -------
     NodeImages
     """
+    if not hasattr(psf, 'grid_xypos'):
+        msg = f'psf must be a GriddedPSFModel, got {psf!r:.80}'
+        raise TypeError(msg)
     oversampling = np.broadcast_to(psf.oversampling, 2).tolist()
     return NodeImages(np.asarray(psf.data, dtype=float),
                       _split_seams(np.array(psf.grid_xypos, float)),

@@ -21,6 +21,7 @@ LIGHT = 173.1446326846693  # speed of light [au / day]
 # The Sun-Earth L2 point lies this fraction of an Earth orbit further out:
 # the cube root of a third of the Earth-Moon to Sun mass ratio.
 L2_FRACTION = (3.0404e-6 / 3) ** (1 / 3)
+MAX_YEAR = 10_000  # numbers beyond it are days, such as a Julian date
 OBSERVERS = ('earth', 'leo', 'l2')
 
 
@@ -48,10 +49,16 @@ def _plain_years(time, name):
         time = np.ma.filled(time, np.nan) if unit == '' else (
             u.Quantity(time).to_value(u.yr))
     try:
-        return np.ma.filled(np.ma.asarray(time, dtype=float), np.nan)
+        years = np.ma.filled(np.ma.asarray(time, dtype=float), np.nan)
     except (TypeError, ValueError) as error:
         msg = f'{name} must be a Time or Julian years, got {time!r:.80}'
         raise TypeError(msg) from error
+    if (np.abs(years) > MAX_YEAR).any():
+        worst = years[np.abs(years) > MAX_YEAR][0] if years.ndim else years
+        msg = (f'{name} must be a Time or Julian years below {MAX_YEAR}, got '
+               f'{worst}, which looks like a date in days')
+        raise ValueError(msg)
+    return years
 
 
 def tdb(years):

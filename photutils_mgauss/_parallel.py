@@ -39,7 +39,7 @@ def map_parallel(function, *columns, executor=None):
         yield from pool.map(function, *columns)
 
 
-def map_chunks(function, arrays, executor, *, chunk_size=None):
+def map_chunks(function, arrays, executor, *, chunk_size=None, most=None):
     """
     Call a function on slices of arrays and join the lists it returns.
 
@@ -53,6 +53,9 @@ def map_chunks(function, arrays, executor, *, chunk_size=None):
         Where to run; see `map_parallel`.
     chunk_size : int, optional
         The length of a slice; by default there are four for each core.
+    most : int, optional
+        The longest slice by default. Short ones end together, on cores that
+        are not equally free.
 
     Returns
     -------
@@ -63,8 +66,8 @@ def map_chunks(function, arrays, executor, *, chunk_size=None):
         msg = ('executor must be a concurrent.futures.Executor, got '
                f'{executor!r:.80}')
         raise TypeError(msg)
-    n = len(arrays[0])
-    size = chunk_size or max(1, -(-n // (4 * available_cores())))
+    n, cores = len(arrays[0]), available_cores()
+    size = chunk_size or max(1, min(-(-n // (4 * cores)), most or n))
     starts = range(0, n, size)
     chunks = ([array[i:i + size] for i in starts] for array in arrays)
     return list(chain.from_iterable(

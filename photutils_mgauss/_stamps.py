@@ -5,6 +5,8 @@ One stamp and the search for its mixture, in the units of the kernels.
 finds where to start it, and the rest turns shape numbers into mixtures and
 back.
 """
+from functools import partial
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +15,9 @@ from photutils_mgauss import _kernels
 from photutils_mgauss._phases import phase_rows
 from photutils_mgauss.mixture import GaussianMixture
 
+# Rows of pixels are a multiple of this long, which makes loops over them
+# vectors without remainder.
+_LANES = 8
 _TOLERANCE = 1e-8
 _MAX_STEPS = 500
 # A Gaussian narrower than this in stamp pixels falls between the pixel
@@ -32,11 +37,12 @@ _ASTROMETRY = (1.0, 10.0, 100.0)
 _ASTROMETRY_ROUNDS = 8
 _ASTROMETRY_STEPS = 4
 _ASTROMETRY_TOLERANCE = 1e-2
-# The steps every split gets, and the better half again; how many of the best
-# go on at the end; and the steps of fits with fewer Gaussians than asked for,
-# which need not converge.
-_TRIAL_STEPS = 6
-_FINALISTS = 2
+# The steps every split gets, and the better half again; the fraction of them,
+# and the least number, that go on at the end; and the steps of fits with fewer
+# Gaussians than asked for, which need not converge.
+_TRIAL_STEPS = 8
+_FINALISTS = 0.15
+_LEAST_FINALISTS = 2
 _PREVIEW_STEPS = 40
 
 
@@ -79,11 +85,13 @@ class Workspace:
 
     def __init__(self, n_components, shape):
         k, n = n_components, 6 * n_components
+        shape = shape[0], -(-shape[1] // _LANES) * _LANES
         self.scratch = (
-            np.empty((k, *shape)), np.empty(shape), np.empty((k, k)),
-            np.empty(k), np.empty((k, k + 1)), np.empty(k, bool),
-            np.empty((k, 6, 6)), np.empty((5, shape[1])), np.empty((5, 5)),
-            np.empty((6, 6)), np.empty((6, 6)))
+            np.empty((k, *shape)), np.empty(shape), np.empty(shape),
+            np.empty((k, k)), np.empty(k), np.empty((k, k + 1)),
+            np.empty(k, bool), np.empty((5, shape[1])), np.empty((k, 6, 6)),
+            np.empty(6), np.empty((5, 5)), np.empty((6, 6)),
+            np.empty((6, 6)))
         self.matrices = np.empty((n, n)), np.empty((n, n))
         self.vectors = (np.empty(n), np.empty(n), np.empty((k, 5)),
                         np.empty(k))
@@ -94,8 +102,9 @@ class Stamp(NamedTuple):
     One image, scaled for the kernels.
 
     ``pixels`` have a peak of 1 and ``weight`` makes their power 1: pixel
-    unit ``scale`` and weight unit ``weight_unit``. Means are relative to
-    ``centre``; ``tie``, ``rows`` and ``limits`` are the kernels'.
+    unit ``scale`` and weight unit ``weight_unit``. Columns of no weight are
+    added on the right. Means are relative to ``centre``; ``tie``, ``rows``
+    and ``limits`` are the kernels'.
     """
 
     pixels: np.ndarray
@@ -121,8 +130,17 @@ class Stamp(NamedTuple):
         reach = _reach(used, centre)
         limits = np.array([np.log(_MIN_STDDEV), np.log(reach.max()), *reach,
                            _STIFFNESS])
-        return cls(pixels, weight / weight_unit, centre, peak, tie,
-                   np.empty((0, *image.shape)), limits, scale, weight_unit)
+        pixels = _widened(pixels)
+        return cls(pixels, _widened(weight / weight_unit), centre, peak, tie,
+                   np.empty((0, *pixels.shape)), limits, scale, weight_unit)
+
+
+def _widened(pixels):
+    """Return the pixels with zeros on the right, for whole vectors a row."""
+    ny, nx = pixels.shape
+    wide = np.zeros((ny, -(-nx // _LANES) * _LANES))
+    wide[:, :nx] = pixels
+    return wide
 
 
 def _reach(used, centre):
@@ -146,17 +164,37 @@ class Solution(NamedTuple):
         return self.fluxes.sum() > _LEAST_FLUX * np.abs(self.fluxes).sum()
 
 
+class Trials(NamedTuple):
+    """The kernels' answers from several starts, the best first."""
+
+    shapes: np.ndarray
+    fluxes: np.ndarray
+    costs: np.ndarray
+    statuses: np.ndarray
+
+    @property
+    def best(self):
+        return Solution(self.shapes[0], self.fluxes[0], float(self.costs[0]),
+                        bool(self.statuses[0] == _kernels.FIT_STOPPED))
+
+
 def run(stamp, problem, spaces, shapes, max_steps=_MAX_STEPS):
     """Return what Levenberg-Marquardt makes of a start (K, 5)."""
-    shapes = shapes.copy()
-    fluxes = np.empty(len(shapes))
-    space = spaces[len(shapes)]
-    cost, status, _ = _kernels.fit_shapes(
-        stamp.pixels, stamp.weight, stamp.centre, shapes, fluxes, stamp.tie,
-        problem.signed, stamp.rows, problem.fixed, stamp.limits, _TOLERANCE,
-        max_steps,
-        space.scratch, space.matrices, space.vectors)
-    return Solution(shapes, fluxes, cost, status == _kernels.FIT_STOPPED)
+    return _run_all(stamp, problem, spaces, shapes[None], max_steps).best
+
+
+def _run_all(stamp, problem, spaces, starts, max_steps):
+    """Return what it makes of each of several starts (n, K, 5)."""
+    n, k = starts.shape[:2]
+    trials = Trials(starts.copy(), np.empty((n, k)), np.empty(n), np.empty(n))
+    space = spaces[k]
+    _kernels.fit_starts(
+        stamp.pixels, stamp.weight, stamp.centre, trials.shapes,
+        trials.fluxes, stamp.tie, problem.signed, stamp.rows, problem.fixed,
+        stamp.limits, _TOLERANCE, max_steps, space.scratch, space.matrices,
+        space.vectors, trials.costs, trials.statuses)
+    order = np.argsort(trials.costs, kind='stable')
+    return Trials(*(each[order] for each in trials))
 
 
 def search(stamp, problem, spaces):
@@ -168,25 +206,20 @@ def search(stamp, problem, spaces):
     fitted. Of starts with K Gaussians at once one in three or fewer finds the
     minimum; this way nearly all do.
     """
+    improved = partial(_run_all, stamp, problem, spaces)
     best = run(stamp, problem, spaces, _core(stamp, problem))
     for k in range(2, problem.n_components + 1):
-        trials = _improved(stamp, problem, spaces,
-                           _splits(best.shapes, problem), _TRIAL_STEPS)
-        half = [trial.shapes for trial in trials[:max(2, len(trials) // 2)]]
-        trials = _improved(stamp, problem, spaces, half, _TRIAL_STEPS)
-        last = k == problem.n_components
-        n_best, steps = (_FINALISTS, _MAX_STEPS) if last else (
-            1, _PREVIEW_STEPS)
-        best, *_ = _improved(stamp, problem, spaces,
-                             [trial.shapes for trial in trials[:n_best]],
-                             steps)
+        starts = _splits(best.shapes, problem)
+        n = len(starts)
+        for share in (n, max(2, n // 2)):
+            starts = improved(starts[:share], _TRIAL_STEPS).shapes
+        if k < problem.n_components:
+            n_best, steps = 1, _PREVIEW_STEPS
+        else:
+            n_best = max(_LEAST_FINALISTS, ceil(_FINALISTS * n))
+            steps = _MAX_STEPS
+        best = improved(starts[:n_best], steps).best
     return best
-
-
-def _improved(stamp, problem, spaces, starts, steps):
-    """Return the starts after some steps, the best first."""
-    return sorted((run(stamp, problem, spaces, start, steps)
-                   for start in starts), key=lambda solution: solution.cost)
 
 
 def refine_astrometry(stamp, problem, spaces, solution):
@@ -197,9 +230,13 @@ def refine_astrometry(stamp, problem, spaces, solution):
     steps are taken with one map, then the next is made. Each solution is
     judged by its own map and the best is kept.
     """
+    improving = False
     for price in _ASTROMETRY:
-        mapped, solution = _price(stamp, problem, spaces, solution, price)
-        best, improving = solution, False
+        mapped, priced = _price(stamp, problem, spaces, solution, price)
+        if not priced.has_flux:
+            break
+        solution = best = priced
+        improving = False
         for _ in range(_ASTROMETRY_ROUNDS):
             before = solution.cost
             trial = run(mapped, problem, spaces, solution.shapes,
@@ -207,6 +244,8 @@ def refine_astrometry(stamp, problem, spaces, solution):
             if not trial.has_flux:
                 break
             mapped, solution = _price(stamp, problem, spaces, trial, price)
+            if not solution.has_flux:
+                break
             small = _ASTROMETRY_TOLERANCE * best.cost
             improving = solution.cost < best.cost - small
             best = min(best, solution, key=lambda each: each.cost)
@@ -246,45 +285,49 @@ def _core(stamp, problem):
 
 def _splits(shapes, problem):
     """
-    Yield starts (K + 1, 5) with one Gaussian more than shapes (K, 5).
+    Return starts (n, K + 1, 5) with one Gaussian more than shapes (K, 5).
 
     Each Gaussian in turn is split in width, along x, along y, and into two of
     different elongation; the last start adds a Gaussian wider than all.
     """
-    for k, parent in enumerate(shapes):
-        rest = np.delete(shapes, k, axis=0)
-        for one, other in _children(parent, problem):
-            yield np.vstack([rest, one, other])
+    k = len(shapes)
+    children = shapes[:, None, None] + _moves(shapes, problem)
+    others = np.nonzero(~np.eye(k, dtype=bool))[1].reshape(k, k - 1)
+    starts = np.empty((k, children.shape[1], k + 1, 5))
+    starts[:, :, :-2] = shapes[others][:, None]
+    starts[:, :, -2:] = children
     widest = shapes[np.argmin(shapes[:, 2] + shapes[:, 4])]
-    yield np.vstack([shapes, _scaled(widest, 2.5)])
+    last = np.vstack([shapes, widest + _widening(widest[3], 2.5)])
+    return np.concatenate([starts.reshape(-1, k + 1, 5), last[None]])
 
 
-def _children(parent, problem):
-    yield _scaled(parent, 1 / 1.5), _scaled(parent, 1.5)
-    if problem.signed:  # a hole in a Gaussian narrower than the parent
-        yield _scaled(parent, 0.5), _scaled(parent, 0.8)
-    if not problem.fixed:
-        for offset in ((0.6, 0.0), (0.0, 0.6)):
-            yield _shifted(parent, 1, offset), _shifted(parent, -1, offset)
-    stretch = np.array([0, 0, 0.4, 0, -0.4])
-    yield parent + stretch, parent - stretch
-    shear = np.array([0, 0, 0, 0.5 * np.exp(parent[4]), 0])
-    yield parent + shear, parent - shear
+def _moves(shapes, problem):
+    """Return how each parent's two children differ from it, (K, n, 2, 5)."""
+    length, t, m = np.exp(shapes[:, 2]), shapes[:, 3], np.exp(shapes[:, 4])
+    moves = np.zeros((len(shapes), 6, 2, 5))
+    for i, factor in enumerate((1 / 1.5, 1.5)):
+        sign = 1 - 2 * i
+        width, stretch, shear, along_x, along_y, hole = np.swapaxes(
+            moves[:, :, i], 0, 1)
+        width[:] = _widening(t, factor)
+        stretch[:, 2], stretch[:, 4] = 0.4 * sign, -0.4 * sign
+        shear[:, 3] = 0.5 * sign * m
+        # By 0.6 where the parent is a circle of radius 1.
+        along_x[:, 0] = 0.6 * sign / length
+        along_y[:, 1] = 0.6 * sign / m
+        along_y[:, 0] = -0.6 * sign * t / (m * length)
+        # A hole in a Gaussian narrower than the parent.
+        hole[:] = _widening(t, (0.5, 0.8)[i])
+    wanted = [True, True, True, *2 * [not problem.fixed], problem.signed]
+    return moves[:, wanted]
 
 
-def _scaled(shape, factor):
-    """Return the Gaussian with its widths times a factor."""
-    x, y, log_l, t, log_m = shape
-    shift = np.log(factor)
-    return np.array([x, y, log_l - shift, t / factor, log_m - shift])
-
-
-def _shifted(shape, sign, offset):
-    """Return it moved by an offset in the frame where it is a circle."""
-    x, y, log_l, t, log_m = shape
-    dy = sign * offset[1] / np.exp(log_m)
-    dx = (sign * offset[0] - t * dy) / np.exp(log_l)
-    return np.array([x + dx, y + dy, log_l, t, log_m])
+def _widening(t, factor):
+    """Return what multiplies the widths of Gaussians by a factor, (..., 5)."""
+    move = np.zeros((*np.shape(t), 5))
+    move[..., 2] = move[..., 4] = -np.log(factor)
+    move[..., 3] = t / factor - t
+    return move
 
 
 # Between shapes and mixtures.
@@ -323,6 +366,13 @@ def mixture_of(solution, problem, centre):
                                         -t / norm)
 
 
+def draw_model(solution, weights, stamp, space):
+    """Return the mixture of unit flux on the stamp's pixels."""
+    images, lanes = space.scratch[0], space.scratch[7]
+    _kernels.draw_unit(solution.shapes, *stamp.centre, lanes[:4], images)
+    return np.tensordot(weights, images, 1)
+
+
 def covariance_of(problem, stamp, solution, space):
     """
     Return the covariance (6K, 6K) of the parameters users see.
@@ -347,8 +397,10 @@ def covariance_of(problem, stamp, solution, space):
         free &= np.tile([True, False, False, True, True, True], n)
     chosen = np.ix_(place[free], place[free])
     slopes = _slopes(solution, problem, stamp)[:, free]
-    inverse = np.linalg.pinv(matrix[chosen], rcond=1e-15, hermitian=True)
-    covariance = slopes @ inverse @ slopes.T
+    powers, directions = np.linalg.eigh(matrix[chosen])
+    seen = powers > 1e-15 * powers[-1:]
+    slopes = slopes @ (directions[:, seen] / np.sqrt(powers[seen]))
+    covariance = slopes @ slopes.T
     covariance /= stamp.weight_unit * stamp.scale**2
     unknown = np.repeat(solution.fluxes == 0, 6)
     covariance[unknown] = covariance[:, unknown] = np.nan

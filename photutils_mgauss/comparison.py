@@ -5,7 +5,12 @@ import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss._phases import phase_error, phase_rows
-from photutils_mgauss._validation import as_integer, as_real, as_shape
+from photutils_mgauss._validation import (
+    as_image,
+    as_integer,
+    as_real,
+    as_shape,
+)
 from photutils_mgauss.fitting import fit_mixture
 from photutils_mgauss.shapes import adaptive_moments
 
@@ -42,7 +47,7 @@ def compare_n_components(image, n_components=(1, 2, 3, 4, 5), **kwargs):
     Raises
     ------
     TypeError, ValueError
-        As by `fit_mixture`.
+        As by `fit_mixture`; also for a stack of images.
 
     Examples
     --------
@@ -53,8 +58,8 @@ def compare_n_components(image, n_components=(1, 2, 3, 4, 5), **kwargs):
     >>> table['max_residual'].round(3)
     array([0.022, 0.   ])
     """
-    numbers = [as_integer(k, 'n_components', minimum=1)
-               for k in np.atleast_1d(np.asarray(n_components, object))]
+    image = as_image(image, 'image')
+    numbers = _as_numbers(n_components)
     fit_mixture(image, 1, **kwargs)  # compiled before the clock starts
     fits, rows = [], []
     for k in numbers:
@@ -66,6 +71,15 @@ def compare_n_components(image, n_components=(1, 2, 3, 4, 5), **kwargs):
     return QTable(rows=rows, names=('n_components', 'time', 'chi2', 'bic',
                                     *_CRITERIA, 'message'),
                   meta={'fits': fits})
+
+
+def _as_numbers(n_components):
+    numbers = [as_integer(k, 'n_components', minimum=1)
+               for k in np.atleast_1d(np.asarray(n_components, object))]
+    if not numbers:
+        msg = 'n_components must name at least one number, got none'
+        raise ValueError(msg)
+    return numbers
 
 
 def _measure(image, fit, options):
@@ -139,7 +153,7 @@ float, optional
     if not limits:
         msg = f'one of {", ".join(_CRITERIA)} must be given, got none'
         raise ValueError(msg)
-    for k in sorted(np.atleast_1d(n_components).tolist()):
+    for k in sorted(_as_numbers(n_components)):
         row = compare_n_components(image, [k], **kwargs)[0]
         if all(abs(row[name]) <= limit for name, limit in limits.items()):
             return k

@@ -19,6 +19,7 @@ from photutils_mgauss._stamps import (
     Stamp,
     Workspace,
     covariance_of,
+    draw_model,
     mixture_of,
     narrow_first,
     refine_astrometry,
@@ -37,6 +38,10 @@ from photutils_mgauss._validation import (
 from photutils_mgauss.mixture import GaussianMixture
 
 __all__ = ['FitStatus', 'MixtureFit', 'fit_mixture']
+
+
+# Stamps that a thread takes at a time.
+_LARGEST_CHUNK = 64
 
 
 class FitStatus(IntEnum):
@@ -271,7 +276,8 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
     weights = _as_weights(error, mask, images.shape)
     starts = _as_starts(start, len(images), problem)
     fits = map_chunks(partial(_fit_stack, problem),
-                      (images, weights, starts), executor)
+                      (images, weights, starts), executor,
+                      most=_LARGEST_CHUNK)
     if not single:
         return fits
     if not fits[0].status.usable:
@@ -303,6 +309,8 @@ def _as_origin(origin, shape):
 
 def _as_weights(error, mask, shape):
     """Return the weights (n, ny, nx), 0 for pixels that are masked."""
+    if error is None and mask is None:
+        return np.broadcast_to(1.0, shape)  # one number in memory
     used = np.broadcast_to(True, shape)
     if mask is not None:
         mask = np.asarray(mask)
@@ -448,13 +456,13 @@ def _report(problem, stamp, image, solution, space):
     area = np.prod(problem.pitch)
     total = stamp.tie[0] if problem.tied else solution.fluxes.sum()
     mixture = mixture_of(solution, problem, stamp.centre)
-    images = space.scratch[0]
-    _kernels.draw_unit(solution.shapes, *stamp.centre, images)
-    model = np.tensordot(mixture.weights, images, 1)
+    model = draw_model(solution, mixture.weights, stamp, space)
+    model = model[:, :image.shape[1]]
     residual = image - stamp.scale * total * model
-    used = stamp.weight > 0
+    weight = stamp.weight[:, :image.shape[1]]
+    used = weight > 0
     n = np.count_nonzero(used)
-    weight = stamp.weight[used] * stamp.weight_unit
+    weight = weight[used] * stamp.weight_unit
     chi2 = float((weight * residual[used] ** 2).sum())
     covariance = covariance_of(problem, stamp, solution, space)
     if not problem.has_error:

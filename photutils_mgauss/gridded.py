@@ -309,10 +309,18 @@ n_components=1)>
         Returns
         -------
         GriddedMixturePSF or dict of them
+
+        Raises
+        ------
+        TypeError
+            If the field is not a `MixtureField`.
         """
         if isinstance(field, Mapping):
             return {name: cls.from_field(one, grid_shape=grid_shape)
                     for name, one in field.items()}
+        if not hasattr(field, 'to_grid'):
+            msg = f'field must be a MixtureField, got {field!r:.80}'
+            raise TypeError(msg)
         return field.to_grid(grid_shape)
 
     @classmethod

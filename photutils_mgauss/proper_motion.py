@@ -485,7 +485,8 @@ class ProperMotionFitter:
     def _solution(self, epochs, result):
         year = result.scene.working_year
         if self.ref_epoch is not None:
-            year = float(julian_years(self.ref_epoch, 'ref_epoch'))
+            year = as_real(julian_years(self.ref_epoch, 'ref_epoch'),
+                           'ref_epoch')
         corrected, residuals = _corrected(epochs, result)
         notes = (*result.frames.undetermined,
                  *few_in_common(result.scene.sightings))

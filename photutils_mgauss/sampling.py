@@ -16,7 +16,12 @@ from astropy.table import QTable
 from scipy.optimize import linear_sum_assignment
 from scipy.special import ndtri
 
-from photutils_mgauss._validation import as_choice, as_integer, as_real
+from photutils_mgauss._validation import (
+    as_choice,
+    as_image,
+    as_integer,
+    as_real,
+)
 from photutils_mgauss.fitting import MixtureFit, fit_mixture
 from photutils_mgauss.mixture import GaussianMixture
 from photutils_mgauss.shapes import adaptive_moments
@@ -25,6 +30,9 @@ __all__ = ['MixturePosterior', 'sample_mixture']
 
 # The paper's priors, in arcsec: Eq. 4.
 _PAPER_ALPHA, _PAPER_BETA, _PAPER_GAMMA, _PAPER_SIGMA = 0.037, 1.0, 0.9, 1.0
+# What of `fit_mixture` has a meaning for the posterior.
+_FIT_KEYWORDS = ('oversampling', 'origin', 'error', 'mask', 'radius',
+                 'enclosed_flux', 'normalize', 'start')
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -223,7 +231,8 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
     **kwargs
         The keywords of `fit_mixture`, which finds where to start:
         ``oversampling``, ``origin``, ``error``, ``mask``, ``radius``,
-        ``enclosed_flux``, ``normalize``, ``start``.
+        ``enclosed_flux``, ``normalize``, ``start``. The model has positive
+        weights and free means, so the others are refused.
 
     Returns
     -------
@@ -232,9 +241,10 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
     Raises
     ------
     TypeError, ValueError
-        As by `fit_mixture`; also without ``pixel_scale`` for the paper's
-        priors, or if a Gaussian has no flux in the least-squares solution,
-        so that its shape has no posterior of its own: use fewer.
+        As by `fit_mixture`; also for a stack of images, without
+        ``pixel_scale`` for the paper's priors, or if a Gaussian has no flux
+        in the least-squares solution, so that its shape has no posterior of
+        its own: use fewer.
 
     Notes
     -----
@@ -264,6 +274,8 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
     >>> posterior.mixture.stddevs.round(1)  # doctest: +SKIP
     array([[1.2, 1. ]])
     """
+    _check_keywords(kwargs)
+    image = as_image(image, 'image')
     prior = as_choice(prior, 'prior', ('scaled', 'paper'))
     as_choice(sampler, 'sampler', ('pymc', 'nutpie', 'numpyro'))
     if prior == 'paper':
@@ -287,6 +299,14 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
                     tune=as_integer(tune, 'tune', minimum=0),
                     chains=as_integer(chains, 'chains', minimum=1))
     return _posterior(idata, data, fit)
+
+
+def _check_keywords(keywords):
+    unknown = sorted(set(keywords) - set(_FIT_KEYWORDS))
+    if unknown:
+        msg = ('sample_mixture takes, beside its own, the keywords '
+               f'{", ".join(_FIT_KEYWORDS)}, got {unknown[0]}')
+        raise TypeError(msg)
 
 
 # From the least-squares solution to a model of PyMC. In vectors the numbers

@@ -59,3 +59,13 @@ def test_thresholds_must_be_given_and_met():
         select_n_components(IMAGE, (1, 2), max_residual=1e-6)
     with pytest.raises(TypeError, match='n_components must be an integer'):
         compare_n_components(IMAGE, (1.5,))
+
+
+def test_a_stack_or_no_number_is_refused():
+    image = TRUTH.render((15, 15), 7, 7)
+    with pytest.raises(ValueError, match='image must have the shape'):
+        compare_n_components([image, image], (1, 2))
+    with pytest.raises(ValueError, match='at least one number'):
+        compare_n_components(image, ())
+    with pytest.raises(ValueError, match='at least one number'):
+        select_n_components(image, (), max_residual=0.1)

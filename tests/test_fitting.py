@@ -87,7 +87,7 @@ def test_pixels_that_are_masked_or_have_no_weight_do_not_matter():
 
 @pytest.mark.parametrize('n_rows', [0, 2])
 def test_the_normal_equations_are_those_of_finite_differences(rng, n_rows):
-    k, shape, centre = 3, (20, 22), np.array([10.0, 9.0])
+    k, shape, centre = 3, (21, 24), np.array([10.0, 9.0])
     shapes = np.column_stack([rng.normal(0, 1, (k, 2)),
                               -np.log([1.5, 2, 3]), rng.normal(0, 0.2, k),
                               -np.log([1.3, 2.5, 3])])
@@ -99,7 +99,8 @@ def test_the_normal_equations_are_those_of_finite_differences(rng, n_rows):
 
     def residual(values):
         images = np.empty((k, *shape))
-        _kernels.draw_unit(values[k:].reshape(k, 5), *centre, images)
+        _kernels.draw_unit(values[k:].reshape(k, 5), *centre,
+                           np.empty((4, shape[1])), images)
         model = np.tensordot(values[:k], images, 1)
         left = stamp - model
         return np.concatenate([(np.sqrt(weight) * left).ravel(),
@@ -433,3 +434,18 @@ def test_astrometric_weighting_keeps_an_exact_fit_exact():
 def test_astrometric_weighting_needs_more_than_native_pixels():
     with pytest.raises(ValueError, match='oversampling must be at least 2'):
         fit_mixture(image_of(TRUTH), 3, weighting='astrometric')
+
+
+@pytest.mark.parametrize(('tilt', 'width'), [
+    (0.0, 0.4), (0.3, 1.0), (1.5, 0.6), (-6.0, 0.5), (40.0, 0.4), (0.2, 9)])
+@pytest.mark.parametrize('mean', [(0.3, -0.2), (-7.0, 11.0), (40.0, 2.0)])
+def test_gaussians_are_drawn_as_they_are_defined(tilt, width, mean):
+    shapes = np.array([[*mean, -np.log(width), tilt, -np.log(1.3 * width)]])
+    images = np.empty((1, 23, 40))
+    _kernels.draw_unit(shapes, 19.5, 11.0, np.empty((4, 40)), images)
+    y, x = np.indices(images.shape[1:])
+    u, v = x - 19.5 - mean[0], y - 11.0 - mean[1]
+    exponent = (u / width + tilt * v)**2 + (v / (1.3 * width))**2
+    peak = 1 / (2 * np.pi * 1.3 * width**2)
+    assert_allclose(images[0], peak * np.exp(-exponent / 2), rtol=1e-11,
+                    atol=1e-100 * peak)

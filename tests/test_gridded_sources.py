@@ -81,6 +81,15 @@ def test_blank_nodes_are_bridged_and_reported():
     assert_is_truth(psf, nodes=[0], rtol=0.1)
 
 
+@pytest.mark.parametrize(('name', 'words'), [
+    ('from_gridded_psf', 'psf must be a GriddedPSFModel, got 3'),
+    ('from_image_psf', 'psf must be made of ImagePSF models, got 3'),
+    ('from_field', 'field must be a MixtureField, got 3')])
+def test_a_source_of_another_type_is_refused(name, words):
+    with pytest.raises(TypeError, match=words):
+        getattr(GriddedMixturePSF, name)(3)
+
+
 def test_a_grid_of_blank_nodes_is_an_error():
     grid = epsf_grid(lambda data: data.fill(0))
     with pytest.raises(ValueError, match='at least one image that can be fi'):

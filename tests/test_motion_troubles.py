@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 from astropy.table import Table
-from motion_scenes import changed, plane_epochs, rms
+from motion_scenes import changed, make_truth, observe, plane_epochs, rms
 from numpy.testing import assert_allclose
 
 from photutils_mgauss import Epoch, ProperMotionFitter, decode_motion_flags
@@ -133,6 +133,22 @@ def test_parallaxes_need_a_sky(rng):
     epochs, _ = plane_epochs(rng)
     with pytest.raises(ValueError, match='parallax must be False'):
         ProperMotionFitter(parallax=True).fit(epochs)
+
+
+def test_an_epoch_without_stars_lacks_references(rng):
+    epochs = observe(make_truth(rng, n_stars=50, n_qso=50), rng)[:3]
+    empty = Epoch(epochs[2].table[:0], epochs[2].wcs, epochs[2].time)
+    with pytest.raises(ValueError, match='epoch 2 must have at least 3 '):
+        ProperMotionFitter(references='qso').fit([*epochs[:2], empty])
+
+
+@pytest.mark.parametrize(('keywords', 'kind', 'words'), [
+    ({'references': 3}, TypeError, 'references must be a table.*got 3'),
+    ({'ref_epoch': np.nan}, ValueError, 'ref_epoch must be finite'),
+    ({'ref_epoch': 57388.5}, ValueError, 'ref_epoch must be .*57388.5')])
+def test_what_is_found_out_in_the_fit_is_named(rng, keywords, kind, words):
+    with pytest.raises(kind, match=words):
+        ProperMotionFitter(**keywords).fit(plane_epochs(rng)[0])
 
 
 def test_a_single_epoch_is_refused(rng):

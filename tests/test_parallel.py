@@ -66,3 +66,10 @@ def test_chunks_join_to_what_one_call_gives(executor):
 def test_what_is_no_executor_is_refused():
     with pytest.raises(TypeError, match='executor must be'):
         map_chunks(list, (np.arange(3),), 4)
+
+
+def test_slices_are_no_longer_than_the_longest_allowed():
+    lengths = map_chunks(lambda a: [len(a)] * len(a), (np.arange(1000),),
+                         None, most=7)
+    assert max(lengths) == 7
+    assert len(lengths) == 1000

@@ -534,6 +534,20 @@ def test_matching_on_the_sky_gives_what_identifiers_give(scene, solution,
     assert np.nanmax(np.abs(away[same].value)) < 0.2
 
 
+def test_pixels_with_a_unit_give_what_plain_ones_do(rng):
+    epochs = observe(make_truth(rng, n_stars=50, n_qso=50), rng)
+    units = dict.fromkeys(('x_fit', 'y_fit', 'x_err', 'y_err'), u.pix)
+    for epoch in epochs:
+        epoch.wcs.pixel_shape = None
+    measured = [Epoch(QTable(epoch.table, units=units), epoch.wcs,
+                      epoch.time) for epoch in epochs]
+    one, two = (ProperMotionFitter(references='qso').fit(some)
+                for some in (epochs, measured))
+    assert_allclose(two.stars['pmra'], one.stars['pmra'])
+    assert_allclose(*(fit.epochs[0].wcs.pixel_to_world_values(10, 20)
+                      for fit in (one, two)), rtol=1e-15)
+
+
 def test_row_numbers_of_photutils_are_not_identifiers(scene):
     _, epochs = scene
     plain = [Epoch(epoch.table['x_fit', 'y_fit', 'x_err', 'y_err', 'qso'],

@@ -114,3 +114,11 @@ def test_arviz_measures_the_same_convergence(rng):
 def test_bad_arguments_are_named(image, arguments, words):
     with pytest.raises(ValueError, match=words):
         sample_mixture(image, **{'n_components': 2, **arguments})
+
+
+def test_what_the_posterior_has_no_place_for_is_refused(image):
+    with pytest.raises(ValueError, match='image must have the shape'):
+        sample_mixture([image, image], 2)
+    for keyword in ('signed', 'means', 'weighting', 'executor'):
+        with pytest.raises(TypeError, match=f'start, got {keyword}'):
+            sample_mixture(image, 2, **{keyword: None})

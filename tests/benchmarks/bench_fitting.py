@@ -101,7 +101,9 @@ def speed(stamps, arguments):
 def cost(stamps, arguments):
     """Print how often the cost is that of the best of five scipy starts."""
     for k, step in ((3, 1), (5, arguments.thin_5)):
-        chosen = stamps[::arguments.thin * step]
+        if str(k) not in arguments.cost_of:
+            continue
+        chosen = stamps[arguments.first::arguments.thin * step]
         ratio = np.array([
             fit_mixture(s, k).chi2 / min(
                 scipy_fit(s, start) for start in scipy_starts(s, k, 5))
@@ -180,7 +182,7 @@ def phase(stamps, arguments):
     """Print pixel-phase errors on optics and on ePSFs of Hubble."""
     chosen = stamps[::arguments.thin]
     for k in (3, 5, 6):
-        for weighting in ('uniform', 'astrometric'):
+        for weighting in arguments.weighting.split(','):
             print_phases('optics', chosen, 2, k, weighting)
     folder = os.environ.get('MGAUSS_REALDATA')
     if folder is None:
@@ -189,10 +191,11 @@ def phase(stamps, arguments):
     epsfs = hubble_epsfs(Path(folder))
     inner = epsfs[1:-1, 1:-1].reshape(-1, *epsfs.shape[2:])
     for k in (3, 5, 8):
-        for weighting in ('uniform', 'astrometric'):
+        for weighting in arguments.weighting.split(','):
             print_phases('F814W, inner nodes', inner, 4, k, weighting)
-    print_phases('F814W, all nodes', epsfs.reshape(-1, *epsfs.shape[2:]), 4,
-                 8, 'astrometric')
+    if 'astrometric' in arguments.weighting:
+        print_phases('F814W, all nodes',
+                     epsfs.reshape(-1, *epsfs.shape[2:]), 4, 8, 'astrometric')
 
 
 def hubble_epsfs(folder):
@@ -238,6 +241,12 @@ def main():
                         help='compare the cost on every so many stamps')
     parser.add_argument('--thin-5', type=int, default=4,
                         help='and on fewer by this factor for K = 5')
+    parser.add_argument('--weighting', default='uniform,astrometric',
+                        help='the weightings of the part phase')
+    parser.add_argument('--first', type=int, default=0,
+                        help='begin the thinned stamps at this one')
+    parser.add_argument('--cost-of', default='3,5',
+                        help='the numbers of Gaussians of the part cost')
     arguments = parser.parse_args()
     if arguments.stamps:
         with np.load(arguments.stamps) as file:
