@@ -6,6 +6,8 @@ from astropy.nddata import NDData, StdDevUncertainty
 from astropy.stats import mad_std
 from astropy.units import Quantity
 
+from photutils_mgauss._validation import as_image
+
 # Statistics of larger images are those of evenly spaced pixels.
 _SAMPLE = 1 << 23
 
@@ -31,15 +33,15 @@ class Image:
         unit = data.unit if isinstance(data, Quantity) else None
         if isinstance(error, Quantity):
             error = error.to_value(unit) if unit is not None else error
-        values = _plane(getattr(data, 'value', data), 'data')
-        bad = None if mask is None else _plane(mask, 'mask', values.shape)
+        values = as_image(data, 'data')
+        bad = None if mask is None else as_image(mask, 'mask', values.shape)
         if np.ma.is_masked(data):
             bad = np.ma.getmaskarray(data) | (False if bad is None
                                               else bad.astype(bool))
         if error is None:
             error = np.broadcast_to(_estimate_noise(values, bad),
                                     values.shape)
-        return cls(values, _plane(error, 'error', values.shape), bad, unit)
+        return cls(values, as_image(error, 'error', values.shape), bad, unit)
 
     @classmethod
     def _of_nddata(cls, data, error, mask):
@@ -77,18 +79,6 @@ class Image:
 def _spaced(shape):
     """Return slices of every so many rows that do not exceed a sample."""
     return np.s_[::max(1, -(-shape[0] * shape[1] // _SAMPLE))]
-
-
-def _plane(value, name, shape=None):
-    value = np.asarray(getattr(value, 'value', value))
-    if value.dtype.kind not in 'buif':
-        msg = f'{name} must be an array of numbers, got {value.dtype}'
-        raise TypeError(msg)
-    if value.ndim != 2 or (shape is not None and value.shape != shape):
-        want = '(ny, nx)' if shape is None else f'that of data, {shape}'
-        msg = f'{name} must have the shape {want}, got {value.shape}'
-        raise ValueError(msg)
-    return value
 
 
 def _estimate_noise(values, bad):

@@ -74,7 +74,7 @@ def tabulate(tile, core):
     y_0, x_0 = tile.origin
     quality = _quality(tile)
     covariance, correlation = tile.covariances()
-    covariance = covariance * _confusion(tile, quality)[:, None, None]
+    covariance = covariance * _confusion(quality)[:, None, None]
     with np.errstate(invalid='ignore'):
         error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     count, chi2, deviation, centre, crowding, _ = quality.T
@@ -142,7 +142,7 @@ def _quality(tile):
     return out
 
 
-def _confusion(tile, quality):
+def _confusion(quality):
     """
     Return the factor of the variance for light that is in no star's model.
 
