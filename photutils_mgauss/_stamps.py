@@ -38,13 +38,13 @@ _ASTROMETRY_ROUNDS = 8
 _ASTROMETRY_STEPS = 4
 _ASTROMETRY_TOLERANCE = 1e-2
 # The steps every split gets, and the better half again: so many, and so many
-# more for each Gaussian; the fraction of them, and the least number, that go
-# on at the end; and the steps of fits with fewer Gaussians than asked for,
-# which need not converge.
+# more for each Gaussian; and the fraction of them, and the least number, that
+# go on at the end. With fewer Gaussians than asked for, trials are shorter and
+# the fit of the best need not converge.
 _TRIAL_STEPS = (3, 2)
 _FINALISTS = 0.05
 _LEAST_FINALISTS = 2
-_PREVIEW_STEPS = 20
+_PREVIEW_TRIAL_STEPS, _PREVIEW_STEPS = 6, 20
 
 
 class Problem(NamedTuple):
@@ -212,14 +212,14 @@ def search(stamp, problem, spaces):
     for k in range(2, problem.n_components + 1):
         starts = _splits(best.shapes, problem)
         n = len(starts)
-        steps = _TRIAL_STEPS[0] + _TRIAL_STEPS[1] * k
-        for share in (n, max(2, n // 2)):
-            starts = improved(starts[:share], steps).shapes
         if k < problem.n_components:
-            n_best, steps = 1, _PREVIEW_STEPS
+            trial, n_best, steps = _PREVIEW_TRIAL_STEPS, 1, _PREVIEW_STEPS
         else:
+            trial = _TRIAL_STEPS[0] + _TRIAL_STEPS[1] * k
             n_best = max(_LEAST_FINALISTS, ceil(_FINALISTS * n))
             steps = _MAX_STEPS
+        for share in (n, max(2, n // 2)):
+            starts = improved(starts[:share], trial).shapes
         best = improved(starts[:n_best], steps).best
     return best
 
