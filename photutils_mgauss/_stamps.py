@@ -86,7 +86,7 @@ class Workspace:
 
     def __init__(self, n_components, shape):
         k, n = n_components, 6 * n_components
-        shape = shape[0], -(-shape[1] // _LANES) * _LANES
+        shape = shape[0], _wide(shape[1])
         self.scratch = (
             np.empty((k, *shape)), np.empty(shape), np.empty(shape),
             np.empty((k, k)), np.empty(k), np.empty((k, k + 1)),
@@ -136,10 +136,15 @@ class Stamp(NamedTuple):
                    np.empty((0, *pixels.shape)), limits, scale, weight_unit)
 
 
+def _wide(nx):
+    """Return the next length that is whole vectors."""
+    return -(-nx // _LANES) * _LANES
+
+
 def _widened(pixels):
     """Return the pixels with zeros on the right, for whole vectors a row."""
     ny, nx = pixels.shape
-    wide = np.zeros((ny, -(-nx // _LANES) * _LANES))
+    wide = np.zeros((ny, _wide(nx)))
     wide[:, :nx] = pixels
     return wide
 
