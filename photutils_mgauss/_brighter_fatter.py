@@ -6,8 +6,8 @@ they hold, which makes bright stars wider than faint ones.
 """
 import numpy as np
 
-from photutils_mgauss._validation import as_real
 from photutils_mgauss.gridded import GriddedMixturePSF
+from photutils_mgauss.utils.validation import as_real
 
 # Half the side of the stamp that a star's photons fall on [pix].
 _HALF = 24

@@ -4,12 +4,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from photutils_mgauss._crowded_image import Image
 from photutils_mgauss._crowded_solve import solve_tile
 from photutils_mgauss._crowded_table import StarTable, tabulate
 from photutils_mgauss._crowded_tile import CELL, TileJob, TileOptions
 from photutils_mgauss._local_psf import LocalPSF
-from photutils_mgauss._parallel import available_cores
+from photutils_mgauss.utils.image import Image
+from photutils_mgauss.utils.parallel import available_cores
 
 # The smallest and the largest size of tiles if none is given [pix].
 _TILES = (1024, 2048)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._validation import as_integer, as_real
+from photutils_mgauss.utils.validation import as_integer, as_real
 
 # Bits of the flags of a pixel.
 SATURATED, COSMIC_RAY, HOT, DEAD, BAD_COLUMN = 1, 2, 4, 8, 16

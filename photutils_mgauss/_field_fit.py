@@ -22,7 +22,7 @@ import numpy as np
 
 from photutils_mgauss import _kernels
 from photutils_mgauss._field_forms import rows_of
-from photutils_mgauss._parallel import available_cores
+from photutils_mgauss.utils.parallel import available_cores
 
 # Standard deviations of the prior on log weight, x, y (of the PSF's width),
 # log_p, s, log_q: of a polynomial's constant, and of its other terms. A good

@@ -15,8 +15,8 @@ from photutils_mgauss._star_stamps import (
     cut_stamps,
     remove_star_noise,
 )
-from photutils_mgauss._tables import read_sources
-from photutils_mgauss._validation import as_image
+from photutils_mgauss.utils.star_columns import read_sources
+from photutils_mgauss.utils.validation import as_image
 
 # Neighbours may be this far off their catalogue positions [pix].
 _NEIGHBOUR_STDDEV = 0.5

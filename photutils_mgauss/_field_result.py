@@ -4,7 +4,7 @@ from astropy.table import QTable
 
 from photutils_mgauss._field_fit import model_stamps, to_vector
 from photutils_mgauss._field_forms import mixture_arrays
-from photutils_mgauss._validation import as_real
+from photutils_mgauss.utils.validation import as_real
 
 
 class Field:

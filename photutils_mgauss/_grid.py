@@ -16,12 +16,12 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._validation import as_floats
 from photutils_mgauss.mixture import (
     GaussianMixture,
     _check_covariances,
     _rows,
 )
+from photutils_mgauss.utils.validation import as_floats
 
 __all__ = ['Grid', 'make_grid']
 

@@ -37,7 +37,6 @@ from operator import add
 
 import numpy as np
 
-from photutils_mgauss._parallel import map_parallel
 from photutils_mgauss._stacked import (
     apply,
     apply_transposed,
@@ -45,6 +44,7 @@ from photutils_mgauss._stacked import (
     inverse_factor,
     invert_2x2,
 )
+from photutils_mgauss.utils.parallel import map_parallel
 
 CHUNK = 8192  # stars worked on at a time: what fits into a processor's cache
 

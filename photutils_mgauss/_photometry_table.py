@@ -2,7 +2,7 @@
 import numpy as np
 from astropy.units import Quantity
 
-from photutils_mgauss import _compat
+from photutils_mgauss.utils import compat
 
 # Bits of the ``flags`` column, see photutils.psf.decode_psf_flags.
 PARTIAL = 1
@@ -63,7 +63,7 @@ def define_flags(result, fit_shape, data_shape):
     mark(~(np.isfinite(x) & np.isfinite(y)), NON_FINITE_POSITION)
     mark(~np.isfinite(flux), NON_FINITE_FLUX)
     mark(~np.isfinite(result.local_bkg), NON_FINITE_LOCAL_BKG)
-    if _compat.FLAGS_FIT_REGION:
+    if compat.FLAGS_FIT_REGION:
         mark(_outside_fit_region(result, fit_shape, data_shape),
              OUTSIDE_FIT_REGION)
     return flags
@@ -131,4 +131,4 @@ def assemble(init_params, group_size, columns, meta):
             table['group_size'] = group_size[rows]
     for name, column in columns.items():
         table[name] = column[rows]
-    return _compat.results_table(table, meta), rows
+    return compat.results_table(table, meta), rows

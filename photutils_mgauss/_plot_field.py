@@ -2,8 +2,8 @@
 import numpy as np
 
 from photutils_mgauss._plot_style import VERMILION
-from photutils_mgauss._validation import as_choice, as_integer
 from photutils_mgauss.shapes import adaptive_moments
+from photutils_mgauss.utils.validation import as_choice, as_integer
 
 
 def plot_field(ax, field, quantity='size', *, n=20):

@@ -11,7 +11,7 @@ from astropy.units import (
     pixel,
 )
 
-from photutils_mgauss import _compat
+from photutils_mgauss.utils import compat
 
 # How files hold the parameters of a model: the columns and their units.
 PARAMETER_COLUMNS = dict.fromkeys(
@@ -47,8 +47,8 @@ class PSFModel(Fittable2DModel):
     # its flux.
     bbox_factor = 5.5
 
-    if _compat.STALE_GROUP_MODELS:
-        __class__ = property(_compat.group_class)
+    if compat.STALE_GROUP_MODELS:
+        __class__ = property(compat.group_class)
 
     def __str__(self):
         return super().__str__().replace(self.__class__.__name__,

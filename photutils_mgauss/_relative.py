@@ -18,8 +18,8 @@ from operator import add
 import numpy as np
 
 from photutils_mgauss._joint import eliminate, parts, scaled_rows
-from photutils_mgauss._parallel import map_parallel
 from photutils_mgauss._stacked import gram
+from photutils_mgauss.utils.parallel import map_parallel
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
-from photutils_mgauss._validation import as_choice
+from photutils_mgauss.utils.validation import as_choice
 
 
 def write_scene(scene, path, layout, overwrite):

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss._simulation_sky import NGP
-from photutils_mgauss._validation import (
+from photutils_mgauss.utils.validation import (
     as_floats,
     as_integer,
     as_real,

@@ -18,10 +18,10 @@ from photutils_mgauss._detector_effects import (
     pattern,
     respond,
 )
-from photutils_mgauss._parallel import map_parallel
 from photutils_mgauss._simulation_brush import brush_of
 from photutils_mgauss._simulation_instrument import Instrument
 from photutils_mgauss._simulation_sky import Exposure
+from photutils_mgauss.utils.parallel import map_parallel
 
 # Rows that share a random stream. It is part of what a seed means.
 _BAND_ROWS = 128

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photutils_mgauss._validation import as_floats, as_real, as_shape
+from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 # Photons per second and square centimetre in a relative band width of 1
 # (d lambda / lambda) from a source of AB magnitude 0: 3631 Jy over h.

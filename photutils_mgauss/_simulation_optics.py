@@ -15,7 +15,7 @@ from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss._simulation_instrument import Band
 from photutils_mgauss._simulation_psf import band_of
-from photutils_mgauss._validation import as_integer, as_real, as_shape
+from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 __doctest_requires__ = {'Optics': ['galsim']}
 

@@ -8,9 +8,9 @@ size, an ellipticity and a coma that change smoothly over the detector.
 import numpy as np
 
 from photutils_mgauss._simulation_instrument import CSST_BANDS
-from photutils_mgauss._validation import as_integer, as_real, as_shape
 from photutils_mgauss.gridded import GriddedMixturePSF
 from photutils_mgauss.mixture import GaussianMixture
+from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 # The PSF in g before the pixel: weights and standard deviations [pix].
 _WEIGHTS = np.array([0.60, 0.28, 0.09, 0.03])

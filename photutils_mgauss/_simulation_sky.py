@@ -37,7 +37,7 @@ from numpy.polynomial import chebyshev, polynomial
 
 from photutils_mgauss._simulation_instrument import Band
 from photutils_mgauss._simulation_psf import band_of
-from photutils_mgauss._validation import as_floats, as_real
+from photutils_mgauss.utils.validation import as_floats, as_real
 
 _LIGHT_SPEED = 299792.458 * u.km / u.s
 _LIGHT_YEARS = (u.au / _LIGHT_SPEED).to_value(u.yr)  # in one au

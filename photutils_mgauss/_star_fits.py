@@ -14,9 +14,9 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._parallel import map_parallel
 from photutils_mgauss.gridded import GriddedMixturePSF
 from photutils_mgauss.model import MultiGaussianPSFModel
+from photutils_mgauss.utils.parallel import map_parallel
 
 CONVERGED = (_kernels._CONVERGED, _kernels._STALLED)
 BAD_ERROR = _kernels._BAD_ERROR

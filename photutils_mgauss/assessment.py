@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss._validation import as_shape
 from photutils_mgauss.mixture import GaussianMixture
 from photutils_mgauss.shapes import adaptive_moments
+from photutils_mgauss.utils.validation import as_shape
 
 __all__ = ['PSFAssessment', 'assess_psf']
 

@@ -5,14 +5,14 @@ import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss._phases import phase_error, phase_rows
-from photutils_mgauss._validation import (
+from photutils_mgauss.fitting import fit_mixture
+from photutils_mgauss.shapes import adaptive_moments
+from photutils_mgauss.utils.validation import (
     as_image,
     as_integer,
     as_real,
     as_shape,
 )
-from photutils_mgauss.fitting import fit_mixture
-from photutils_mgauss.shapes import adaptive_moments
 
 __all__ = ['compare_n_components', 'select_n_components']
 

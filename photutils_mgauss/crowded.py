@@ -14,7 +14,6 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss import _injection as injection
 from photutils_mgauss import _kernels
-from photutils_mgauss._crowded_image import Image, find_gain
 from photutils_mgauss._crowded_plan import Plan, run
 from photutils_mgauss._crowded_table import (
     REPEATED,
@@ -24,7 +23,8 @@ from photutils_mgauss._crowded_table import (
 from photutils_mgauss._crowded_tile import TileOptions
 from photutils_mgauss._injection import InjectionResult
 from photutils_mgauss._local_psf import LocalPSF
-from photutils_mgauss._validation import (
+from photutils_mgauss.utils.image import Image, find_gain
+from photutils_mgauss.utils.validation import (
     as_floats,
     as_integer,
     as_real,

@@ -22,8 +22,8 @@ from scipy.sparse.linalg import LinearOperator, lsqr
 from photutils_mgauss import _field_stages as stages
 from photutils_mgauss._field_input import normalised, read_sample
 from photutils_mgauss._field_result import lattice
-from photutils_mgauss._validation import as_integer, as_real, as_shape
 from photutils_mgauss.field import MixtureField, fit_mixture_field
+from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 __all__ = ['EmpiricalPSF']
 

@@ -38,10 +38,10 @@ from photutils_mgauss._field_result import (
     star_table,
 )
 from photutils_mgauss._files import storable, table_columns
-from photutils_mgauss._validation import as_integer, as_real, as_shape
 from photutils_mgauss.gridded import GriddedMixturePSF
 from photutils_mgauss.mixture import GaussianMixture
 from photutils_mgauss.tuned_field import TunedMixtureField, known_shapes
+from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 __all__ = ['MixtureField', 'fit_mixture_field']
 

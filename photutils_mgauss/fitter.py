@@ -15,9 +15,10 @@ import numpy as np
 from astropy.modeling.fitting import fitter_unit_support
 from scipy.linalg import cho_solve, cholesky
 
-from photutils_mgauss import _compat, _kernels
+from photutils_mgauss import _kernels
 from photutils_mgauss._psf_model import PSFModel
-from photutils_mgauss._validation import as_integer
+from photutils_mgauss.utils import compat
+from photutils_mgauss.utils.validation import as_integer
 
 __all__ = ['MixtureFitter']
 
@@ -176,7 +177,7 @@ class _Problem:
     """Weighted residuals and Jacobian as functions of the free parameters."""
 
     def __init__(self, model, x, y, z, weights):
-        self.base, self.n_sources = _compat.group_members(model)
+        self.base, self.n_sources = compat.group_members(model)
         self.x, self.y, self.z = (
             _as_plain(a, name).astype(float)
             for a, name in ((x, 'x'), (y, 'y'), (z, 'z')))

@@ -13,7 +13,6 @@ from functools import partial
 import numpy as np
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._parallel import map_chunks
 from photutils_mgauss._stamps import (
     Problem,
     Stamp,
@@ -27,7 +26,9 @@ from photutils_mgauss._stamps import (
     search,
     shapes_of,
 )
-from photutils_mgauss._validation import (
+from photutils_mgauss.mixture import GaussianMixture
+from photutils_mgauss.utils.parallel import map_chunks
+from photutils_mgauss.utils.validation import (
     as_choice,
     as_floats,
     as_integer,
@@ -35,7 +36,6 @@ from photutils_mgauss._validation import (
     as_shape,
     as_stack,
 )
-from photutils_mgauss.mixture import GaussianMixture
 
 __all__ = ['FitStatus', 'MixtureFit', 'fit_mixture']
 

@@ -34,9 +34,9 @@ from photutils_mgauss._psf_model import (
     split_flux,
     with_unit,
 )
-from photutils_mgauss._validation import as_choice, as_floats, as_shape
 from photutils_mgauss.mixture import GaussianMixture
 from photutils_mgauss.model import MultiGaussianPSFModel
+from photutils_mgauss.utils.validation import as_choice, as_floats, as_shape
 
 __all__ = ['GriddedMixturePSF']
 

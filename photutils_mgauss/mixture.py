@@ -14,7 +14,7 @@ from scipy.special import erf
 
 from photutils_mgauss import _kernels
 from photutils_mgauss._files import storable
-from photutils_mgauss._validation import as_floats, as_real, as_shape
+from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = ['GaussianMixture', 'Moments', 'blend']
 

@@ -22,8 +22,8 @@ from photutils_mgauss._psf_model import (
     strip_units,
     with_unit,
 )
-from photutils_mgauss._validation import as_integer
 from photutils_mgauss.mixture import GaussianMixture
+from photutils_mgauss.utils.validation import as_integer
 
 __all__ = ['MultiGaussianPSFModel']
 

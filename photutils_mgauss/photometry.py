@@ -19,11 +19,12 @@ from astropy.nddata import NDData
 from astropy.utils.exceptions import AstropyUserWarning
 from photutils.psf import PSFPhotometry
 
-from photutils_mgauss import _compat, _star_fits
 from photutils_mgauss import _photometry_table as _table
+from photutils_mgauss import _star_fits
 from photutils_mgauss._photometry_result import FitInfo, FitResult
-from photutils_mgauss._validation import as_choice, as_real
 from photutils_mgauss.fitter import MixtureFitter, as_max_steps
+from photutils_mgauss.utils import compat
+from photutils_mgauss.utils.validation import as_choice, as_real
 
 __all__ = ['MixturePSFPhotometry']
 
@@ -154,10 +155,10 @@ class MixturePSFPhotometry(PSFPhotometry):
         if not self._can_fit:
             return super().__call__(data, mask=mask, error=error,
                                     init_params=init_params)
-        _compat.reset(self)
+        compat.reset(self)
         if isinstance(data, NDData):
-            data, mask, error = _compat.split_nddata(data, mask, error)
-        data, mask, error, init_params = _compat.prepare_inputs(
+            data, mask, error = compat.split_nddata(data, mask, error)
+        data, mask, error, init_params = compat.prepare_inputs(
             self, data, mask, error, init_params)
         if init_params is None:
             return None
@@ -254,7 +255,7 @@ class MixturePSFPhotometry(PSFPhotometry):
         columns = _table.make_columns(result, quality, flags, self.data_unit)
         columns |= self._extra_columns(result)
         table, rows = _table.assemble(self.init_params, group_size, columns,
-                                      _compat.results_meta(self))
+                                      compat.results_meta(self))
         self.fit_info = FitInfo(result, rows)
         return table
 
@@ -307,8 +308,8 @@ class _Start:
                 self.lower[:, k] = self.initial[:, k] - bound
                 self.upper[:, k] = self.initial[:, k] + bound
             flagged[k] = self.free[k] and (
-                _compat.FLAGS_MODEL_BOUNDS or (k > 0
-                                               and xy_bounds is not None))
+                compat.FLAGS_MODEL_BOUNDS or (k > 0
+                                              and xy_bounds is not None))
         self.flagged_bounds = flagged
 
     def _set_boxes(self, fit_shape, image):

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.stats import mad_std
 
-from photutils_mgauss._validation import as_floats, as_integer
+from photutils_mgauss.utils.validation import as_floats, as_integer
 
 __all__ = ['PixelPhaseError', 'pixel_phase_error']
 

@@ -38,8 +38,8 @@ from photutils_mgauss._parallax import (
     tdb,
 )
 from photutils_mgauss._transforms import Transform
-from photutils_mgauss._validation import as_choice, as_integer, as_real
 from photutils_mgauss.matching import Tolerance
+from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 
 __all__ = ['Epoch', 'MotionSolution', 'ProperMotionFitter',
            'bootstrap_median', 'decode_motion_flags']

@@ -22,7 +22,7 @@ from math import prod
 import numpy as np
 from astropy.io import fits
 
-from photutils_mgauss._validation import as_real
+from photutils_mgauss.utils.validation import as_real
 
 __all__ = ['PSFExModel', 'read_psfex']
 

@@ -16,15 +16,15 @@ from astropy.table import QTable
 from scipy.optimize import linear_sum_assignment
 from scipy.special import ndtri
 
-from photutils_mgauss._validation import (
+from photutils_mgauss.fitting import MixtureFit, fit_mixture
+from photutils_mgauss.mixture import GaussianMixture
+from photutils_mgauss.shapes import adaptive_moments
+from photutils_mgauss.utils.validation import (
     as_choice,
     as_image,
     as_integer,
     as_real,
 )
-from photutils_mgauss.fitting import MixtureFit, fit_mixture
-from photutils_mgauss.mixture import GaussianMixture
-from photutils_mgauss.shapes import adaptive_moments
 
 __all__ = ['MixturePosterior', 'sample_mixture']
 

@@ -9,8 +9,8 @@ from photutils.utils.exceptions import NoDetectionsWarning
 from scipy.spatial import KDTree
 
 from photutils_mgauss._star_stamps import cut_stamps
-from photutils_mgauss._tables import read_sources
-from photutils_mgauss._validation import as_image, as_integer, as_real
+from photutils_mgauss.utils.star_columns import read_sources
+from photutils_mgauss.utils.validation import as_image, as_integer, as_real
 
 __all__ = ['select_psf_stars']
 

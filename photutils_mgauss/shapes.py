@@ -13,9 +13,9 @@ from enum import IntEnum
 import numpy as np
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._parallel import map_chunks
-from photutils_mgauss._validation import as_floats, as_shape, as_stack
 from photutils_mgauss.mixture import GaussianMixture
+from photutils_mgauss.utils.parallel import map_chunks
+from photutils_mgauss.utils.validation import as_floats, as_shape, as_stack
 
 __all__ = ['ShapeStatus', 'Shapes', 'adaptive_moments']
 

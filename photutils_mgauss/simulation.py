@@ -37,8 +37,8 @@ from photutils_mgauss._simulation_instrument import (
 from photutils_mgauss._simulation_optics import Optics
 from photutils_mgauss._simulation_psf import csst_psf
 from photutils_mgauss._simulation_sky import Exposure, paper_exposures
-from photutils_mgauss._validation import as_floats, as_real, as_shape
 from photutils_mgauss.gridded import GriddedMixturePSF
+from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = [
     'CSST_BANDS', 'PAPER_DENSITY', 'Band', 'DetectorEffects', 'Exposure',

@@ -27,13 +27,13 @@ from photutils_mgauss._star_fits import (
     psf_arrays,
 )
 from photutils_mgauss._tangent_plane import TangentPlane, directions
-from photutils_mgauss._validation import as_shape
 from photutils_mgauss._wcs_tools import (
     check_celestial,
     invert_wcs,
     pixel_jacobian,
     pixel_to_vectors,
 )
+from photutils_mgauss.utils.validation import as_shape
 
 __all__ = ['add_sky_positions', 'fit_many']
 

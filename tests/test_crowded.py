@@ -19,13 +19,13 @@ from photutils_mgauss import (
     _kernels,
     inject_and_recover,
 )
-from photutils_mgauss._crowded_image import Image
 from photutils_mgauss._crowded_plan import Plan
 from photutils_mgauss._crowded_sky import Mesh
 from photutils_mgauss._crowded_stars import Neighbours, Stars
 from photutils_mgauss._crowded_table import NOT_SEEN, REPEATED
 from photutils_mgauss._crowded_tile import Tile, TileJob, TileOptions
 from photutils_mgauss._local_psf import LocalPSF
+from photutils_mgauss.utils.image import Image
 
 MIXTURE = GaussianMixture([0.8, 0.2], [[0, 0], [0.1, 0]],
                           [[[0.6, 0.05], [0.05, 0.5]], [[3, 0], [0, 3]]])

@@ -5,13 +5,13 @@ from threading import Barrier, Event
 import numpy as np
 import pytest
 
-from photutils_mgauss import _parallel
-from photutils_mgauss._parallel import map_chunks, map_parallel
+from photutils_mgauss.utils import parallel
+from photutils_mgauss.utils.parallel import map_chunks, map_parallel
 
 
 @pytest.fixture(autouse=True)
 def four_cores(monkeypatch):
-    monkeypatch.setattr(_parallel, 'available_cores', lambda: 4)
+    monkeypatch.setattr(parallel, 'available_cores', lambda: 4)
 
 
 @pytest.fixture(params=['threads', 'executor'])

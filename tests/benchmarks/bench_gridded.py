@@ -16,7 +16,7 @@ from photutils.psf import PSFPhotometry
 
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF
 from photutils_mgauss._node_images import NodeImages
-from photutils_mgauss._parallel import available_cores
+from photutils_mgauss.utils.parallel import available_cores
 
 WIDTHS = np.array([1.1, 1.9, 3.5, 5.0, 2.5])
 SHARES = np.array([0.7, 0.2, 0.1, 0.03, 0.1])

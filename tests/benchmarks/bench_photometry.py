@@ -46,7 +46,7 @@ from photutils_mgauss import (
     MixturePSFPhotometry,
     MultiGaussianPSFModel,
 )
-from photutils_mgauss._parallel import available_cores
+from photutils_mgauss.utils.parallel import available_cores
 
 PARTS = ('speed', 'groups', 'sextractor', 'compilation', 'agreement',
          'errors', 'phase')

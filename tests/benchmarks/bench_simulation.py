@@ -12,13 +12,13 @@ import numpy as np
 from astropy.table import QTable
 from photutils.datasets import make_model_image
 
-from photutils_mgauss._parallel import available_cores
 from photutils_mgauss.simulation import (
     Instrument,
     crowded_field,
     csst_psf,
     simulate,
 )
+from photutils_mgauss.utils.parallel import available_cores
 
 
 def clock(function):

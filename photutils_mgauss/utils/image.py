@@ -6,7 +6,7 @@ from astropy.nddata import NDData, StdDevUncertainty
 from astropy.stats import mad_std
 from astropy.units import Quantity
 
-from photutils_mgauss._validation import as_image
+from photutils_mgauss.utils.validation import as_image
 
 # Statistics of larger images are those of evenly spaced pixels.
 _SAMPLE = 1 << 23

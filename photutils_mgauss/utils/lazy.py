@@ -1,0 +1,34 @@
+"""Names that a package hands on and loads when they are first used."""
+from importlib import import_module
+
+
+def hand_on(package, owners):
+    """
+    Return `__getattr__`, `__dir__` and `__all__` of a package.
+
+    Parameters
+    ----------
+    package : str
+        Its ``__name__``.
+    owners : dict
+        Public name -> the module below the package that owns it.
+
+    Returns
+    -------
+    load, listing : callable
+        The module's `__getattr__` and `__dir__` (PEP 562).
+    names : list of str
+        Its ``__all__``.
+    """
+    def load(name):
+        if name not in owners:
+            msg = f'module {package!r} has no attribute {name!r}'
+            raise AttributeError(msg)
+        value = getattr(import_module(f'{package}.{owners[name]}'), name)
+        setattr(import_module(package), name, value)
+        return value
+
+    def listing():
+        return sorted({*vars(import_module(package)), *owners})
+
+    return load, listing, list(owners)
