@@ -105,7 +105,7 @@ def is_table(path):
     """Whether a file is a table rather than an image."""
     if Path(path).suffix.lower() in _TABLE_SUFFIXES:
         return True
-    from photutils_mgauss._image_layers import is_asdf, open_fits
+    from photutils_mgauss.files.image_layers import is_asdf, open_fits
     if is_asdf(path):
         return False
     with open_fits(path) as hdus:
@@ -182,8 +182,8 @@ def _from_catalogue(options, i):
 
 def _wcs_of(options, i, record):
     """Return the WCS named by an option, or that of the record's image."""
-    from photutils_mgauss._image_layers import read_wcs
     from photutils_mgauss._images import Reading, read_image
+    from photutils_mgauss.files.image_layers import read_wcs
     given = tools.one_each(options.wcs, len(options.inputs), 'wcs')[i]
     if given is not None:
         return read_wcs(given)

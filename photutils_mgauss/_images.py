@@ -12,9 +12,9 @@ import numpy as np
 from photutils.background import Background2D
 from photutils.utils import calc_total_error
 
-from photutils_mgauss._image_header import electrons_in_unit
-from photutils_mgauss._image_layers import read_layers, read_wcs
 from photutils_mgauss._parallax import julian_years
+from photutils_mgauss.files.image_header import electrons_in_unit
+from photutils_mgauss.files.image_layers import read_layers, read_wcs
 from photutils_mgauss.noise import background_error, pixel_error
 
 # The sky is not measured in boxes with a larger share of bad pixels [%].
@@ -71,7 +71,7 @@ class StarImage:
     ----------
     path : `~pathlib.Path`
         Its file.
-    layers : `~photutils_mgauss._image_layers.Layers`
+    layers : `~photutils_mgauss.files.image_layers.Layers`
         The arrays.
     reading : `Reading`
         What the user says of them.

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 import numpy as np
 from photutils.psf import ImagePSF
 
-from photutils_mgauss.psf_io import read_psfex
+from photutils_mgauss.files.psfex import read_psfex
 from photutils_mgauss.utils.validation import as_floats, as_shape
 
 __all__ = ['NodeImages', 'of_gridded_psf', 'of_image_psf', 'of_psfex']

@@ -191,7 +191,7 @@ def write_psf(psf, path, record):
     if path.suffix == '.asdf':
         import asdf
 
-        from photutils_mgauss._asdf import enabled
+        from photutils_mgauss.files.asdf_extension import enabled
         with enabled():
             asdf.AsdfFile({'psf': psf, 'mgauss': record}).write_to(path)
         return

@@ -37,7 +37,7 @@ from photutils_mgauss._field_result import (
     residual_stars,
     star_table,
 )
-from photutils_mgauss._files import storable, table_columns
+from photutils_mgauss.files.storage import storable, table_columns
 from photutils_mgauss.gridded import GriddedMixturePSF
 from photutils_mgauss.mixture import GaussianMixture
 from photutils_mgauss.tuned_field import TunedMixtureField, known_shapes

@@ -18,7 +18,6 @@ from astropy.table import QTable
 from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._files import storable, table_columns
 from photutils_mgauss._grid import checked_arrays, make_grid
 from photutils_mgauss._node_images import (
     of_gridded_psf,
@@ -34,6 +33,7 @@ from photutils_mgauss._psf_model import (
     split_flux,
     with_unit,
 )
+from photutils_mgauss.files.storage import storable, table_columns
 from photutils_mgauss.mixture import GaussianMixture
 from photutils_mgauss.model import MultiGaussianPSFModel
 from photutils_mgauss.utils.validation import as_choice, as_floats, as_shape

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import erf
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._files import storable
+from photutils_mgauss.files.storage import storable
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = ['GaussianMixture', 'Moments', 'blend']

@@ -11,7 +11,6 @@ The weights of K Gaussians are held as K - 1 stick-breaking fractions
 import numpy as np
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._files import storable
 from photutils_mgauss._psf_model import (
     PARAMETER_COLUMNS,
     PSFModel,
@@ -22,6 +21,7 @@ from photutils_mgauss._psf_model import (
     strip_units,
     with_unit,
 )
+from photutils_mgauss.files.storage import storable
 from photutils_mgauss.mixture import GaussianMixture
 from photutils_mgauss.utils.validation import as_integer
 

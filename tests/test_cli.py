@@ -16,8 +16,8 @@ from astropy.table import QTable
 from astropy.wcs import WCS
 
 from photutils_mgauss import GriddedMixturePSF, __version__, _demo
-from photutils_mgauss._image_layers import read_wcs
 from photutils_mgauss.cli import main
+from photutils_mgauss.files.image_layers import read_wcs
 
 # Where this package is imported from, also from another folder.
 SOURCES = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get(

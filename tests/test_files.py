@@ -21,7 +21,7 @@ from photutils_mgauss import (
     MixtureField,
     MultiGaussianPSFModel,
 )
-from photutils_mgauss._asdf import enabled
+from photutils_mgauss.files.asdf_extension import enabled
 
 ROOT = Path(__file__).parents[1]
 

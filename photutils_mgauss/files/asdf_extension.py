@@ -12,7 +12,7 @@ import asdf
 import numpy as np
 from asdf.extension import Converter, Extension, TagDefinition
 
-from photutils_mgauss._stored import VERSION, check_version, complete
+from photutils_mgauss.files.layout import VERSION, check_version, complete
 
 _BASE = 'asdf://photutils_mgauss/'
 

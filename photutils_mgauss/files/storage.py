@@ -14,7 +14,7 @@ import numpy as np
 from astropy.io import fits, registry
 from astropy.io.fits.connect import is_fits
 
-from photutils_mgauss._stored import VERSION, check_version, complete
+from photutils_mgauss.files.layout import VERSION, check_version, complete
 
 __all__ = ['storable', 'table_columns']
 
@@ -208,7 +208,7 @@ def _is_asdf(origin, path, file, *args, **kwargs):
 def _write_asdf(stored, file, *, overwrite=False):
     import asdf
 
-    from photutils_mgauss._asdf import enabled
+    from photutils_mgauss.files.asdf_extension import enabled
     with enabled():
         tree = asdf.AsdfFile({'psf': stored})
         if hasattr(file, 'write'):
@@ -237,7 +237,7 @@ def _read_asdf(cls, file):
 def _stored_in_asdf(file):
     import asdf
 
-    from photutils_mgauss._asdf import CLASSES, enabled
+    from photutils_mgauss.files.asdf_extension import CLASSES, enabled
     with enabled(), warnings.catch_warnings():
         # An unknown version of a tag is only a warning of asdf.
         warnings.simplefilter('error')

@@ -17,7 +17,7 @@ from astropy.nddata.bitmask import bitfield_to_boolean_mask
 from astropy.time import Time
 from astropy.wcs import WCS
 
-from photutils_mgauss._image_header import Cards
+from photutils_mgauss.files.image_header import Cards
 
 # Names of extensions with the noise, and what is in them.
 _NOISE = {'ERR': 'error', 'ERROR': 'error', 'UNCERT': 'error',
