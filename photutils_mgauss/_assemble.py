@@ -4,20 +4,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from photutils_mgauss._epoch import Epoch, plane_unit, read_epoch, sky_vectors
-from photutils_mgauss._parallax import observer_position
 from photutils_mgauss._references import (
     Catalogue,
     is_table,
     read_catalogue,
 )
 from photutils_mgauss._stacked import sandwich_2x2
-from photutils_mgauss._tangent_plane import TangentPlane
 from photutils_mgauss.alignment import tie_plane
 from photutils_mgauss.matching import (
     Matches,
     match_ids,
     match_positions,
 )
+from photutils_mgauss.sky.observers import observer_position
+from photutils_mgauss.sky.tangent_plane import TangentPlane
 
 TRIALS = 300   # maps through a few stars that are tried for a plane
 FAR = 0.01     # of the field: how far a star may be from its place

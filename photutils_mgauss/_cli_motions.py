@@ -291,7 +291,7 @@ def write_wcs(epoch, name, record):
         return
     from astropy.io import fits
 
-    from photutils_mgauss._parallax import tdb
+    from photutils_mgauss.sky.observers import tdb
     header = epoch.wcs.to_header(relax=True)
     header['MJD-AVG'] = tdb(epoch.mean_year).mjd, 'middle of the exposure'
     header['TIMESYS'] = 'TDB'

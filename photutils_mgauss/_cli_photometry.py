@@ -147,5 +147,5 @@ def exposure(image, name):
 
 
 def _jyear(time):
-    from photutils_mgauss._parallax import julian_years
+    from photutils_mgauss.sky.observers import julian_years
     return float(julian_years(time))

@@ -185,7 +185,7 @@ def parse_time(text):
         return None
     from astropy.time import Time
 
-    from photutils_mgauss._parallax import tdb
+    from photutils_mgauss.sky.observers import tdb
     if re.fullmatch(r'\d{4}(\.\d*)?', text):
         return tdb(float(text))
     try:

@@ -26,10 +26,10 @@ from astropy.modeling.models import (
 from astropy.wcs import WCS
 
 from photutils_mgauss._epoch import numbers, pixel_size
-from photutils_mgauss._parallax import remove_aberration
-from photutils_mgauss._tangent_plane import TangentPlane, directions
-from photutils_mgauss._transforms import exponents, monomials
-from photutils_mgauss._wcs_tools import celestial_frame, pixel_to_vectors
+from photutils_mgauss.sky.observers import remove_aberration
+from photutils_mgauss.sky.tangent_plane import TangentPlane, directions
+from photutils_mgauss.sky.transforms import exponents, monomials
+from photutils_mgauss.sky.wcs import celestial_frame, pixel_to_vectors
 
 DEGREE = 3.6e6  # milliarcseconds
 GRID = 25       # points on a side of what polynomials are fitted to
@@ -45,7 +45,7 @@ class Correction:
     Parameters
     ----------
     plane : `TangentPlane`
-    transform : `~photutils_mgauss._transforms.Transform`
+    transform : `~photutils_mgauss.sky.transforms.Transform`
     coefficients : (2, b) `~numpy.ndarray`
     velocity : (3,) `~numpy.ndarray` or None
         Velocity of the observer, whose aberration is removed first.

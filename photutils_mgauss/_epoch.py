@@ -11,15 +11,15 @@ import numpy as np
 from astropy.coordinates import CartesianRepresentation
 from astropy.table import Table
 
-from photutils_mgauss._parallax import (
+from photutils_mgauss._stacked import sandwich_2x2
+from photutils_mgauss.sky.observers import (
     _known_observer,
     julian_years,
     observer_velocity,
     remove_aberration,
 )
-from photutils_mgauss._stacked import sandwich_2x2
-from photutils_mgauss._tangent_plane import unit_vectors
-from photutils_mgauss._wcs_tools import (
+from photutils_mgauss.sky.tangent_plane import unit_vectors
+from photutils_mgauss.sky.wcs import (
     check_celestial,
     pixel_jacobian,
     pixel_to_vectors,

@@ -119,8 +119,8 @@ class Problem:
         Times since the working epoch [yr].
     observer : (3, E, 1) or (3, E, n) `~numpy.ndarray` or None
         Barycentric places of the observer [au], None without parallax.
-    plane : `~photutils_mgauss._tangent_plane.TangentPlane` or None
-    transform : `~photutils_mgauss._transforms.Transform`
+    plane : `~photutils_mgauss.sky.tangent_plane.TangentPlane` or None
+    transform : `~photutils_mgauss.sky.transforms.Transform`
     priors : `Priors`
     acceleration : bool
     ties : (n,) bool `~numpy.ndarray`

@@ -17,10 +17,10 @@ from photutils_mgauss._joint import (
     parts,
     solve_all,
 )
-from photutils_mgauss._parallax import tdb
 from photutils_mgauss._references import FIXED
 from photutils_mgauss._stacked import invert_2x2
-from photutils_mgauss._tangent_plane import directions
+from photutils_mgauss.sky.observers import tdb
+from photutils_mgauss.sky.tangent_plane import directions
 from photutils_mgauss.utils.parallel import map_parallel
 
 # What each bit of a star's flags means.

@@ -21,8 +21,8 @@ import numpy as np
 from photutils_mgauss._fit_motions import Fit, build_problem
 from photutils_mgauss._joint import Priors, solve_all
 from photutils_mgauss._references import FIXED
-from photutils_mgauss._transforms import Transform
 from photutils_mgauss.alignment import MOTIONS, POSITIONS, Frames
+from photutils_mgauss.sky.transforms import Transform
 
 
 @dataclass(frozen=True, eq=False)

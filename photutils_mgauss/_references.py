@@ -13,9 +13,9 @@ from astropy.table import Table
 
 from photutils_mgauss._epoch import find_column, numbers
 from photutils_mgauss._joint import Priors
-from photutils_mgauss._parallax import julian_years
 from photutils_mgauss._stacked import apply
-from photutils_mgauss._tangent_plane import unit_vectors
+from photutils_mgauss.sky.observers import julian_years
+from photutils_mgauss.sky.tangent_plane import unit_vectors
 
 CLASSES = ('qso', 'galaxy', 'star', 'position')
 FIXED = ('qso', 'galaxy')  # neither move nor have a parallax

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import chdtri, ndtr
 
 from photutils_mgauss._stacked import invert_2x2
-from photutils_mgauss._transforms import Transform, fit_map
+from photutils_mgauss.sky.transforms import Transform, fit_map
 
 SIGNIFICANT = 2.0  # standard deviations that call for a floor
 NULL = 1e-10  # relative to the information before stars are eliminated

@@ -32,13 +32,9 @@ from photutils_mgauss._motion_table import (
     validation_table,
 )
 from photutils_mgauss._paper_recipe import fit_paper
-from photutils_mgauss._parallax import (
-    julian_years,
-    observer_velocity,
-    tdb,
-)
-from photutils_mgauss._transforms import Transform
 from photutils_mgauss.matching import Tolerance
+from photutils_mgauss.sky.observers import julian_years, observer_velocity, tdb
+from photutils_mgauss.sky.transforms import Transform
 from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 
 __all__ = ['Epoch', 'MotionSolution', 'ProperMotionFitter',

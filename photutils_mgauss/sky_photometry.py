@@ -26,8 +26,8 @@ from photutils_mgauss._star_fits import (
     is_fixed_shape,
     psf_arrays,
 )
-from photutils_mgauss._tangent_plane import TangentPlane, directions
-from photutils_mgauss._wcs_tools import (
+from photutils_mgauss.sky.tangent_plane import TangentPlane, directions
+from photutils_mgauss.sky.wcs import (
     check_celestial,
     invert_wcs,
     pixel_jacobian,

@@ -20,7 +20,7 @@ from photutils_mgauss import (
     barycentric_observer,
     invert_wcs,
 )
-from photutils_mgauss._wcs_tools import pixel_to_vectors
+from photutils_mgauss.sky.wcs import pixel_to_vectors
 
 BOX = ((-0.5, 999.5), (-0.5, 799.5))
 

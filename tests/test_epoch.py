@@ -25,17 +25,17 @@ from numpy.testing import assert_allclose
 
 from photutils_mgauss import Epoch, barycentric_observer, invert_wcs
 from photutils_mgauss._epoch import read_epoch, sky_vectors
-from photutils_mgauss._parallax import (
+from photutils_mgauss.sky.observers import (
     add_aberration,
     observer_position,
     remove_aberration,
 )
-from photutils_mgauss._tangent_plane import (
+from photutils_mgauss.sky.tangent_plane import (
     TangentPlane,
     directions,
     unit_vectors,
 )
-from photutils_mgauss._wcs_tools import pixel_jacobian, pixel_to_vectors
+from photutils_mgauss.sky.wcs import pixel_jacobian, pixel_to_vectors
 
 
 def table(**columns):

@@ -31,11 +31,11 @@ from motion_scenes import (
 
 from photutils_mgauss import Epoch, ProperMotionFitter
 from photutils_mgauss._joint import Priors, Problem, reduce_all, solve_all
-from photutils_mgauss._parallax import observer_position
-from photutils_mgauss._tangent_plane import TangentPlane
-from photutils_mgauss._transforms import Transform
 from photutils_mgauss.alignment import Gauge, solve_frames
 from photutils_mgauss.matching import Tolerance, match_positions
+from photutils_mgauss.sky.observers import observer_position
+from photutils_mgauss.sky.tangent_plane import TangentPlane
+from photutils_mgauss.sky.transforms import Transform
 
 
 class OneThread:

@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 
-from photutils_mgauss._tangent_plane import local_axes, unit_vectors
+from photutils_mgauss.sky.tangent_plane import local_axes, unit_vectors
 
 STEP = 0.5  # pixels either side of a star for derivatives of a WCS
 
