@@ -6,7 +6,7 @@ they hold, which makes bright stars wider than faint ones.
 """
 import numpy as np
 
-from photutils_mgauss.gridded import GriddedMixturePSF
+from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.utils.validation import as_real
 
 # Half the side of the stamp that a star's photons fall on [pix].

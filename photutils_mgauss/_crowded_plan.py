@@ -7,7 +7,7 @@ import numpy as np
 from photutils_mgauss._crowded_solve import solve_tile
 from photutils_mgauss._crowded_table import StarTable, tabulate
 from photutils_mgauss._crowded_tile import CELL, TileJob, TileOptions
-from photutils_mgauss._local_psf import LocalPSF
+from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.image import Image
 from photutils_mgauss.utils.parallel import available_cores
 

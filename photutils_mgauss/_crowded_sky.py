@@ -2,7 +2,7 @@
 import numpy as np
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._local_psf import cells
+from photutils_mgauss.psf.local import cells
 
 # How strongly neighbouring nodes are tied, in units of a node's information.
 _TIE = 1e-3

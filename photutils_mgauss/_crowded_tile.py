@@ -20,7 +20,7 @@ import numpy as np
 from photutils_mgauss import _kernels
 from photutils_mgauss._crowded_sky import Mesh
 from photutils_mgauss._crowded_stars import Neighbours, Stars
-from photutils_mgauss._local_psf import MAX_WING
+from photutils_mgauss.psf.local import MAX_WING
 
 # Fit stamps are 7 or 9 pixels wide, 13 for bright stars: almost all of the
 # information on a position lies in the core.

@@ -2,7 +2,7 @@
 import numpy as np
 
 from photutils_mgauss._plot_style import VERMILION
-from photutils_mgauss.shapes import adaptive_moments
+from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.validation import as_choice, as_integer
 
 

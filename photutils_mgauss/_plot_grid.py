@@ -3,7 +3,7 @@ import numpy as np
 from astropy.stats import mad_std
 
 from photutils_mgauss._plot_style import BLACK, BLUE, ORANGE
-from photutils_mgauss.shapes import adaptive_moments
+from photutils_mgauss.psf.shapes import adaptive_moments
 
 __all__ = [
     'plot_node_map',

@@ -10,9 +10,9 @@ from astropy.utils.exceptions import AstropyUserWarning
 from photutils.psf import GriddedPSFModel, ImagePSF, STDPSFGrid
 
 from photutils_mgauss.field import MixtureField
-from photutils_mgauss.gridded import GriddedMixturePSF
-from photutils_mgauss.mixture import GaussianMixture
-from photutils_mgauss.model import MultiGaussianPSFModel
+from photutils_mgauss.psf.gridded import GriddedMixturePSF
+from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.psf.model import MultiGaussianPSFModel
 
 __all__ = ['psf_kind', 'psf_record', 'read_psf', 'write_psf']
 

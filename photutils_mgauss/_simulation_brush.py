@@ -13,7 +13,7 @@ from photutils.psf import GriddedPSFModel
 from scipy.ndimage import gaussian_filter, spline_filter
 
 from photutils_mgauss import _kernels
-from photutils_mgauss.gridded import GriddedMixturePSF
+from photutils_mgauss.psf.gridded import GriddedMixturePSF
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ import numpy as np
 
 from photutils_mgauss import _kernels
 from photutils_mgauss._phases import phase_rows
-from photutils_mgauss.mixture import GaussianMixture
+from photutils_mgauss.psf.mixture import GaussianMixture
 
 # Rows of pixels are a multiple of this long, which makes loops over them
 # vectors without remainder.

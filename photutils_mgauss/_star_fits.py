@@ -14,8 +14,8 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from photutils_mgauss import _kernels
-from photutils_mgauss.gridded import GriddedMixturePSF
-from photutils_mgauss.model import MultiGaussianPSFModel
+from photutils_mgauss.psf.gridded import GriddedMixturePSF
+from photutils_mgauss.psf.model import MultiGaussianPSFModel
 from photutils_mgauss.utils.parallel import map_parallel
 
 CONVERGED = (_kernels._CONVERGED, _kernels._STALLED)

@@ -6,7 +6,7 @@ from astropy.table import QTable
 
 from photutils_mgauss._phases import phase_error, phase_rows
 from photutils_mgauss.fitting import fit_mixture
-from photutils_mgauss.shapes import adaptive_moments
+from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.validation import (
     as_image,
     as_integer,

@@ -22,7 +22,7 @@ from photutils_mgauss._crowded_table import (
 )
 from photutils_mgauss._crowded_tile import TileOptions
 from photutils_mgauss._injection import InjectionResult
-from photutils_mgauss._local_psf import LocalPSF
+from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.image import Image, find_gain
 from photutils_mgauss.utils.validation import (
     as_floats,

@@ -38,8 +38,8 @@ from photutils_mgauss._field_result import (
     star_table,
 )
 from photutils_mgauss.files.storage import storable, table_columns
-from photutils_mgauss.gridded import GriddedMixturePSF
-from photutils_mgauss.mixture import GaussianMixture
+from photutils_mgauss.psf.gridded import GriddedMixturePSF
+from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.tuned_field import TunedMixtureField, known_shapes
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 

@@ -16,7 +16,7 @@ from astropy.modeling.fitting import fitter_unit_support
 from scipy.linalg import cho_solve, cholesky
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._psf_model import PSFModel
+from photutils_mgauss.psf.base import PSFModel
 from photutils_mgauss.utils import compat
 from photutils_mgauss.utils.validation import as_integer
 

@@ -26,7 +26,7 @@ from photutils_mgauss._stamps import (
     search,
     shapes_of,
 )
-from photutils_mgauss.mixture import GaussianMixture
+from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.parallel import map_chunks
 from photutils_mgauss.utils.validation import (
     as_choice,

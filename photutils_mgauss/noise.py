@@ -248,8 +248,8 @@ class _Jets:
 
 
 def _jet_arrays(psf):
-    from photutils_mgauss.mixture import GaussianMixture
-    from photutils_mgauss.model import MultiGaussianPSFModel
+    from photutils_mgauss.psf.mixture import GaussianMixture
+    from photutils_mgauss.psf.model import MultiGaussianPSFModel
     if isinstance(psf, GaussianMixture):
         psf = MultiGaussianPSFModel(psf)
     if hasattr(psf, 'to_grid'):

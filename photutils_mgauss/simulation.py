@@ -37,7 +37,7 @@ from photutils_mgauss._simulation_instrument import (
 from photutils_mgauss._simulation_optics import Optics
 from photutils_mgauss._simulation_psf import csst_psf
 from photutils_mgauss._simulation_sky import Exposure, paper_exposures
-from photutils_mgauss.gridded import GriddedMixturePSF
+from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = [

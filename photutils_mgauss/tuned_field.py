@@ -27,8 +27,8 @@ from photutils_mgauss._field_forms import (
 )
 from photutils_mgauss._field_input import normalised
 from photutils_mgauss._field_result import Field, lattice
-from photutils_mgauss.gridded import GriddedMixturePSF
-from photutils_mgauss.mixture import GaussianMixture
+from photutils_mgauss.psf.gridded import GriddedMixturePSF
+from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.validation import as_real, as_shape
 
 __all__ = ['TunedMixtureField']

@@ -24,7 +24,7 @@ from photutils_mgauss._crowded_sky import Mesh
 from photutils_mgauss._crowded_stars import Neighbours, Stars
 from photutils_mgauss._crowded_table import NOT_SEEN, REPEATED
 from photutils_mgauss._crowded_tile import Tile, TileJob, TileOptions
-from photutils_mgauss._local_psf import LocalPSF
+from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.image import Image
 
 MIXTURE = GaussianMixture([0.8, 0.2], [[0, 0], [0.1, 0]],

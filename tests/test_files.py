@@ -257,10 +257,10 @@ _asdf.extensions(), _asdf.resource_mappings()
 heavy = {{'photutils', 'numba', 'scipy', 'astropy.modeling'}}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
 asdf.open({str(tmp_path / 'b.asdf')!r}).close()
-assert 'photutils_mgauss.gridded' not in sys.modules
+assert 'photutils_mgauss.psf.gridded' not in sys.modules
 with asdf.open({str(tmp_path / 'a.asdf')!r}) as file:
     print(file['psf'])
-    assert 'photutils_mgauss.gridded' in sys.modules
+    assert 'photutils_mgauss.psf.gridded' in sys.modules
 """
     out = subprocess.run([sys.executable, '-W', 'error::UserWarning', '-c',
                           code], check=True, capture_output=True, text=True)

@@ -182,7 +182,7 @@ def test_p33_models_are_pickled_by_their_public_class(stars):
     PSFPhotometry(psf, (9, 9), grouper=SourceGrouper(10))(
         draw(psf, stars), init_params=nearby(stars))
     content = pickle.dumps(psf)
-    assert b'photutils_mgauss.gridded' in content
+    assert b'photutils_mgauss.psf.gridded' in content
     assert b'GriddedMixturePSF_' not in content
     again = pickle.loads(content)
     assert_array_equal(again(COLUMNS, ROWS), psf(COLUMNS, ROWS))

@@ -15,8 +15,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import PSFPhotometry
 
 from photutils_mgauss._simulation_bound import covariances
-from photutils_mgauss.gridded import GriddedMixturePSF
-from photutils_mgauss.mixture import GaussianMixture
+from photutils_mgauss.psf.gridded import GriddedMixturePSF
+from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.simulation import (
     CSST_BANDS,
     Band,

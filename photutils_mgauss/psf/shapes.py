@@ -13,7 +13,7 @@ from enum import IntEnum
 import numpy as np
 
 from photutils_mgauss import _kernels
-from photutils_mgauss.mixture import GaussianMixture
+from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.parallel import map_chunks
 from photutils_mgauss.utils.validation import as_floats, as_shape, as_stack
 

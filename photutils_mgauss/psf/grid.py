@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from photutils_mgauss import _kernels
-from photutils_mgauss.mixture import (
+from photutils_mgauss.psf.mixture import (
     GaussianMixture,
     _check_covariances,
     _rows,

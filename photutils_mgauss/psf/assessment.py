@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss.mixture import GaussianMixture
-from photutils_mgauss.shapes import adaptive_moments
+from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.validation import as_shape
 
 __all__ = ['PSFAssessment', 'assess_psf']

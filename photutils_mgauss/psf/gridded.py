@@ -18,14 +18,14 @@ from astropy.table import QTable
 from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._grid import checked_arrays, make_grid
 from photutils_mgauss._node_images import (
     of_gridded_psf,
     of_image_psf,
     of_psfex,
 )
 from photutils_mgauss._nodes import fit_nodes, plain_report
-from photutils_mgauss._psf_model import (
+from photutils_mgauss.files.storage import storable, table_columns
+from photutils_mgauss.psf.base import (
     PARAMETER_COLUMNS,
     PSFModel,
     flat_points,
@@ -33,9 +33,9 @@ from photutils_mgauss._psf_model import (
     split_flux,
     with_unit,
 )
-from photutils_mgauss.files.storage import storable, table_columns
-from photutils_mgauss.mixture import GaussianMixture
-from photutils_mgauss.model import MultiGaussianPSFModel
+from photutils_mgauss.psf.grid import checked_arrays, make_grid
+from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.psf.model import MultiGaussianPSFModel
 from photutils_mgauss.utils.validation import as_choice, as_floats, as_shape
 
 __all__ = ['GriddedMixturePSF']

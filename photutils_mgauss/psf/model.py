@@ -11,7 +11,8 @@ The weights of K Gaussians are held as K - 1 stick-breaking fractions
 import numpy as np
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._psf_model import (
+from photutils_mgauss.files.storage import storable
+from photutils_mgauss.psf.base import (
     PARAMETER_COLUMNS,
     PSFModel,
     PSFParameter,
@@ -21,8 +22,7 @@ from photutils_mgauss._psf_model import (
     strip_units,
     with_unit,
 )
-from photutils_mgauss.files.storage import storable
-from photutils_mgauss.mixture import GaussianMixture
+from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.validation import as_integer
 
 __all__ = ['MultiGaussianPSFModel']
