@@ -14,8 +14,8 @@ from photutils_mgauss import (
     adaptive_moments,
     fit_mixture,
 )
-from photutils_mgauss._phases import phase_error, phase_rows
-from photutils_mgauss._stamps import Workspace
+from photutils_mgauss.fitting.phases import phase_error, phase_rows
+from photutils_mgauss.fitting.search import Workspace
 
 TRUTH = GaussianMixture.from_stddevs(
     [0.55, 0.35, 0.1], [[0.1, -0.05], [-0.2, 0.1], [0.3, 0.4]],

@@ -9,7 +9,7 @@ from photutils_mgauss import (
     compare_n_components,
     fit_mixture,
 )
-from photutils_mgauss.sampling import MixturePosterior
+from photutils_mgauss.fitting.posterior import MixturePosterior
 
 pytest.importorskip('matplotlib')
 

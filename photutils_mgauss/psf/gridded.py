@@ -18,13 +18,13 @@ from astropy.table import QTable
 from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._node_images import (
+from photutils_mgauss.files.storage import storable, table_columns
+from photutils_mgauss.fitting.node_images import (
     of_gridded_psf,
     of_image_psf,
     of_psfex,
 )
-from photutils_mgauss._nodes import fit_nodes, plain_report
-from photutils_mgauss.files.storage import storable, table_columns
+from photutils_mgauss.fitting.nodes import fit_nodes, plain_report
 from photutils_mgauss.psf.base import (
     PARAMETER_COLUMNS,
     PSFModel,

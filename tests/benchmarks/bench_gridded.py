@@ -15,7 +15,7 @@ from astropy.table import QTable
 from photutils.psf import PSFPhotometry
 
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF
-from photutils_mgauss._node_images import NodeImages
+from photutils_mgauss.fitting.node_images import NodeImages
 from photutils_mgauss.utils.parallel import available_cores
 
 WIDTHS = np.array([1.1, 1.9, 3.5, 5.0, 2.5])

@@ -16,7 +16,7 @@ import time
 import numpy as np
 from psf_stamps import make_stamps
 
-from photutils_mgauss.sampling import (
+from photutils_mgauss.fitting.posterior import (
     effective_size,
     relabel,
     sample_mixture,

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._stamps import (
+from photutils_mgauss.fitting.search import (
     Problem,
     Stamp,
     Workspace,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._phases import phase_rows
+from photutils_mgauss.fitting.phases import phase_rows
 from photutils_mgauss.psf.mixture import GaussianMixture
 
 # Rows of pixels are a multiple of this long, which makes loops over them

@@ -4,8 +4,8 @@ import time
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss._phases import phase_error, phase_rows
-from photutils_mgauss.fitting import fit_mixture
+from photutils_mgauss.fitting.image import fit_mixture
+from photutils_mgauss.fitting.phases import phase_error, phase_rows
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.validation import (
     as_image,

@@ -18,7 +18,7 @@ from astropy.table import QTable
 from scipy.ndimage import map_coordinates, spline_filter
 from tqdm.auto import tqdm
 
-from photutils_mgauss.fitting import fit_mixture
+from photutils_mgauss.fitting.image import fit_mixture
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.parallel import available_cores
 from photutils_mgauss.utils.validation import as_choice, as_integer, as_real

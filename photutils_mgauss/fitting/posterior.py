@@ -16,7 +16,7 @@ from astropy.table import QTable
 from scipy.optimize import linear_sum_assignment
 from scipy.special import ndtri
 
-from photutils_mgauss.fitting import MixtureFit, fit_mixture
+from photutils_mgauss.fitting.image import MixtureFit, fit_mixture
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.validation import (
