@@ -22,7 +22,7 @@ except ImportError:  # a source tree that was never installed
 
 # Public name -> the module that owns it.
 _OWNERS = {
-    'EmpiricalPSF': 'empirical',
+    'EmpiricalPSF': 'field.empirical',
     'CrowdedMixturePhotometry': 'crowded',
     'InjectionResult': 'crowded',
     'UnfinishedTilesError': 'crowded',
@@ -30,10 +30,10 @@ _OWNERS = {
     'GriddedMixturePSF': 'psf.gridded',
     'PSFAssessment': 'psf.assessment',
     'assess_psf': 'psf.assessment',
-    'MixtureField': 'field',
-    'TunedMixtureField': 'tuned_field',
-    'fit_mixture_field': 'field',
-    'select_psf_stars': 'selection',
+    'MixtureField': 'field.mixture_field',
+    'TunedMixtureField': 'field.tuned_field',
+    'fit_mixture_field': 'field.mixture_field',
+    'select_psf_stars': 'field.selection',
     'MultiGaussianPSFModel': 'psf.model',
     'GaussianMixture': 'psf.mixture',
     'PSFExModel': 'files.psfex',

@@ -104,7 +104,7 @@ def from_file(path, options):
 
 def from_stars(image, options):
     """Return the grid of an image's own stars, and facts about it."""
-    from photutils_mgauss.field import fit_mixture_field
+    from photutils_mgauss.field.mixture_field import fit_mixture_field
     given = {name: getattr(options, name)
              for name in ('n_components', 'degree', 'radius')}
     fit = {'radius': _RADIUS}
@@ -124,7 +124,7 @@ def from_stars(image, options):
 
 
 def _choose(image, radius, options):
-    from photutils_mgauss.selection import select_psf_stars
+    from photutils_mgauss.field.selection import select_psf_stars
     sources = None
     if options.stars is not None:
         sources, _ = tools.read_table(options.stars)

@@ -9,7 +9,7 @@ from astropy.io import fits
 from astropy.utils.exceptions import AstropyUserWarning
 from photutils.psf import GriddedPSFModel, ImagePSF, STDPSFGrid
 
-from photutils_mgauss.field import MixtureField
+from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.model import MultiGaussianPSFModel

@@ -8,14 +8,14 @@ from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_allclose
 
 from photutils_mgauss import GaussianMixture, fit_mixture_field
-from photutils_mgauss._field_fit import (
+from photutils_mgauss.field.forms import FreeShapes
+from photutils_mgauss.field.normal import (
     Problem,
     Workers,
     equations,
     to_coefficients,
 )
-from photutils_mgauss._field_forms import FreeShapes
-from photutils_mgauss._star_stamps import Stamps
+from photutils_mgauss.field.stamps import Stamps
 
 SHAPE = (200, 240)
 

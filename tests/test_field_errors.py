@@ -8,7 +8,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_allclose
 
 from photutils_mgauss import GaussianMixture, fit_mixture_field
-from photutils_mgauss._field_fit import to_coefficients
+from photutils_mgauss.field.normal import to_coefficients
 
 SHAPE = (160, 180)
 PLACES = [(30, 30), (90, 80), (150, 40), (120, 140)]

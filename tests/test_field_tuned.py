@@ -10,7 +10,7 @@ from photutils_mgauss import (
     assess_psf,
     fit_mixture_field,
 )
-from photutils_mgauss._field_forms import (
+from photutils_mgauss.field.forms import (
     TunedShapes,
     convolved,
     covariances_of,

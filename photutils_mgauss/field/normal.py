@@ -21,7 +21,7 @@ from itertools import pairwise
 import numpy as np
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._field_forms import rows_of
+from photutils_mgauss.field.forms import rows_of
 from photutils_mgauss.utils.parallel import available_cores
 
 # Standard deviations of the prior on log weight, x, y (of the PSF's width),

@@ -2,8 +2,8 @@
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss._field_fit import model_stamps, to_vector
-from photutils_mgauss._field_forms import mixture_arrays
+from photutils_mgauss.field.forms import mixture_arrays
+from photutils_mgauss.field.normal import model_stamps, to_vector
 from photutils_mgauss.utils.validation import as_real
 
 

@@ -17,30 +17,26 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss import _field_stages as stages
-from photutils_mgauss._field_choice import choose
-from photutils_mgauss._field_fit import Workers
-from photutils_mgauss._field_forms import (
-    TunedShapes,
-    convolved,
-    mixture_arrays,
-)
-from photutils_mgauss._field_input import (
-    normalised,
-    possible_degree,
-    read_sample,
-)
-from photutils_mgauss._field_result import (
+from photutils_mgauss.field import stages
+from photutils_mgauss.field.base import (
     Field,
     covariance_of,
     lattice,
     residual_stars,
     star_table,
 )
+from photutils_mgauss.field.choice import choose
+from photutils_mgauss.field.forms import TunedShapes, convolved, mixture_arrays
+from photutils_mgauss.field.input import (
+    normalised,
+    possible_degree,
+    read_sample,
+)
+from photutils_mgauss.field.normal import Workers
+from photutils_mgauss.field.tuned_field import TunedMixtureField, known_shapes
 from photutils_mgauss.files.storage import storable, table_columns
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
-from photutils_mgauss.tuned_field import TunedMixtureField, known_shapes
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 __all__ = ['MixtureField', 'fit_mixture_field']

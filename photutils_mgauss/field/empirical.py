@@ -19,10 +19,13 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, lsqr
 
-from photutils_mgauss import _field_stages as stages
-from photutils_mgauss._field_input import normalised, read_sample
-from photutils_mgauss._field_result import lattice
-from photutils_mgauss.field import MixtureField, fit_mixture_field
+from photutils_mgauss.field import stages
+from photutils_mgauss.field.base import lattice
+from photutils_mgauss.field.input import normalised, read_sample
+from photutils_mgauss.field.mixture_field import (
+    MixtureField,
+    fit_mixture_field,
+)
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 __all__ = ['EmpiricalPSF']

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from photutils_mgauss._field_fit import (
+from photutils_mgauss.field.forms import TunedShapes
+from photutils_mgauss.field.normal import (
     Equations,
     Prior,
     Problem,
@@ -15,7 +16,6 @@ from photutils_mgauss._field_fit import (
     optimise,
     to_vector,
 )
-from photutils_mgauss._field_forms import TunedShapes
 
 # Stars used while the degree is low: enough for its few coefficients.
 _START_STARS = 40

@@ -6,15 +6,11 @@ import numpy as np
 from astropy.table import QTable, Table
 from astropy.utils.exceptions import AstropyUserWarning
 
-from photutils_mgauss import _field_stages as stages
-from photutils_mgauss._field_choice import DEGREES
-from photutils_mgauss._field_fit import Problem
-from photutils_mgauss._field_forms import FreeShapes
-from photutils_mgauss._star_stamps import (
-    Stamps,
-    cut_stamps,
-    remove_star_noise,
-)
+from photutils_mgauss.field import stages
+from photutils_mgauss.field.choice import DEGREES
+from photutils_mgauss.field.forms import FreeShapes
+from photutils_mgauss.field.normal import Problem
+from photutils_mgauss.field.stamps import Stamps, cut_stamps, remove_star_noise
 from photutils_mgauss.utils.star_columns import read_sources
 from photutils_mgauss.utils.validation import as_image
 

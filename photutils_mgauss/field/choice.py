@@ -2,8 +2,8 @@
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss import _field_stages as stages
-from photutils_mgauss._field_fit import equations
+from photutils_mgauss.field import stages
+from photutils_mgauss.field.normal import equations
 
 N_FOLDS = 3
 DEGREES = (0, 1, 2, 3, 4, 5)

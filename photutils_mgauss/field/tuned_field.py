@@ -19,14 +19,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss import _field_stages as stages
-from photutils_mgauss._field_forms import (
-    TunedShapes,
-    covariances_of,
-    shapes_of,
-)
-from photutils_mgauss._field_input import normalised
-from photutils_mgauss._field_result import Field, lattice
+from photutils_mgauss.field import stages
+from photutils_mgauss.field.base import Field, lattice
+from photutils_mgauss.field.forms import TunedShapes, covariances_of, shapes_of
+from photutils_mgauss.field.input import normalised
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.validation import as_real, as_shape

@@ -8,7 +8,7 @@ from photutils.detection import DAOStarFinder
 from photutils.utils.exceptions import NoDetectionsWarning
 from scipy.spatial import KDTree
 
-from photutils_mgauss._star_stamps import cut_stamps
+from photutils_mgauss.field.stamps import cut_stamps
 from photutils_mgauss.utils.star_columns import read_sources
 from photutils_mgauss.utils.validation import as_image, as_integer, as_real
 
