@@ -91,7 +91,7 @@ def measure(image, psf, options):
 def _sparse(image, psf, options):
     from photutils.detection import DAOStarFinder
 
-    from photutils_mgauss.photometry import MixturePSFPhotometry
+    from photutils_mgauss.photometry.psf_photometry import MixturePSFPhotometry
     fwhm = _fwhm(psf, image.data.shape)
     threshold = options.threshold or 5.0
     finder = DAOStarFinder(threshold * float(
@@ -132,7 +132,7 @@ def _with_unit(table, unit):
 def _with_sky(table, image):
     if image.wcs is None:
         return table
-    from photutils_mgauss.sky_photometry import add_sky_positions
+    from photutils_mgauss.photometry.many_images import add_sky_positions
     return add_sky_positions(table, image.wcs)
 
 

@@ -14,7 +14,7 @@ from photutils.utils import calc_total_error
 
 from photutils_mgauss.files.image_header import electrons_in_unit
 from photutils_mgauss.files.image_layers import read_layers, read_wcs
-from photutils_mgauss.noise import background_error, pixel_error
+from photutils_mgauss.photometry.noise import background_error, pixel_error
 from photutils_mgauss.sky.observers import julian_years
 
 # The sky is not measured in boxes with a larger share of bad pixels [%].

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photutils_mgauss._star_fits import CONVERGED
+from photutils_mgauss.photometry.engine import CONVERGED
 
 _MESSAGES = {
     0: 'The fit stopped at its largest number of iterations.',

@@ -19,10 +19,10 @@ from astropy.nddata import NDData
 from astropy.utils.exceptions import AstropyUserWarning
 from photutils.psf import PSFPhotometry
 
-from photutils_mgauss import _photometry_table as _table
-from photutils_mgauss import _star_fits
-from photutils_mgauss._photometry_result import FitInfo, FitResult
-from photutils_mgauss.fitter import MixtureFitter, as_max_steps
+from photutils_mgauss.photometry import engine
+from photutils_mgauss.photometry import table as _table
+from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
+from photutils_mgauss.photometry.result import FitInfo, FitResult
 from photutils_mgauss.utils import compat
 from photutils_mgauss.utils.validation import as_choice, as_real
 
@@ -190,13 +190,13 @@ class MixturePSFPhotometry(PSFPhotometry):
         `~astropy.table.QTable`
             See `fit_many`.
         """
-        from photutils_mgauss.sky_photometry import fit_many
+        from photutils_mgauss.photometry.many_images import fit_many
         return fit_many(images, coordinates, **kwargs)
 
     @property
     def _can_fit(self):
         return (isinstance(self.fitter, MixtureFitter)
-                and _star_fits.is_fixed_shape(self.psf_model))
+                and engine.is_fixed_shape(self.psf_model))
 
     @property
     def _free(self):
@@ -225,7 +225,7 @@ class MixturePSFPhotometry(PSFPhotometry):
             error = np.sqrt(background
                             + np.maximum(data, 0, dtype=float) / gain)
             gain = None
-        return _star_fits.Image.from_arrays(data, error, mask, gain)
+        return engine.Image.from_arrays(data, error, mask, gain)
 
     def _fit(self, image, init_params):
         """Return the FitResult and the group sizes of all stars."""
@@ -238,8 +238,8 @@ class MixturePSFPhotometry(PSFPhotometry):
         starts = np.unique(np.concatenate([[0], np.flatnonzero(
             np.diff(inverse[rows])) + 1, [rows.size]]))
         stars = start.stars(rows, starts, ~self._free)
-        fits = _star_fits.fit_stars(
-            image, _star_fits.psf_arrays(self.psf_model), stars,
+        fits = engine.fit_stars(
+            image, engine.psf_arrays(self.psf_model), stars,
             fit_sky=self.fit_sky, executor=self.executor,
             max_iterations=as_max_steps(self.fitter_maxiters,
                                         'fitter_maxiters'),
@@ -327,11 +327,11 @@ class _Start:
         finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(flux)
         self.reasons[finite & ~near] = _table.NO_OVERLAP
         usable = finite & near
-        self.boxes[usable] = _star_fits.cut_boxes(x[usable], y[usable],
-                                                  fit_shape, data_shape)
+        self.boxes[usable] = engine.cut_boxes(x[usable], y[usable],
+                                              fit_shape, data_shape)
         area = self.boxes[:, 2] * self.boxes[:, 3]
         self.reasons[usable & (area == 0)] = _table.NO_OVERLAP
-        self.n_pixels = _star_fits.count_pixels(image, self.boxes)
+        self.n_pixels = engine.count_pixels(image, self.boxes)
         self.reasons[(area > 0) & (self.n_pixels == 0)] = _table.FULLY_MASKED
         few = (self.n_pixels > 0) & (self.n_pixels
                                      < np.count_nonzero(self.free))
@@ -342,13 +342,13 @@ class _Start:
         """Return the stars of the rows, ready to be fitted."""
         # A background that is not finite is not subtracted, only flagged.
         sky = np.where(np.isfinite(self.local_bkg), self.local_bkg, 0.0)
-        return _star_fits.Stars(self.initial[rows], self.boxes[rows],
-                                sky[rows], starts, self.lower[rows],
-                                self.upper[rows], fixed)
+        return engine.Stars(self.initial[rows], self.boxes[rows],
+                            sky[rows], starts, self.lower[rows],
+                            self.upper[rows], fixed)
 
     def result(self, rows, fits):
         """Return the results of all stars, of which rows were fitted."""
-        full = _star_fits.Fits.empty(len(self.initial))
+        full = engine.Fits.empty(len(self.initial))
         for target, source in zip(full.arrays, fits.arrays, strict=True):
             target[rows] = source
         return FitResult(
@@ -359,7 +359,7 @@ class _Start:
 
 
 def _check_errors(fits, stars):
-    bad = fits.outcome[:, 0] == _star_fits.BAD_ERROR
+    bad = fits.outcome[:, 0] == engine.BAD_ERROR
     if bad.any():
         _, x, y = stars.initial[bad.argmax()]
         msg = ('error must be positive and finite under the stars, got a '

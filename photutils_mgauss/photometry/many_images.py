@@ -20,7 +20,7 @@ from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import QTable
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._star_fits import (
+from photutils_mgauss.photometry.engine import (
     Image,
     cut_boxes,
     is_fixed_shape,

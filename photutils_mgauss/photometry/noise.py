@@ -18,7 +18,7 @@ import numpy as np
 from photutils.utils import calc_total_error
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._star_fits import cut_boxes, psf_arrays
+from photutils_mgauss.photometry.engine import cut_boxes, psf_arrays
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = ['CramerRao', 'cramer_rao', 'pixel_error']
