@@ -23,10 +23,10 @@ except ImportError:  # a source tree that was never installed
 # Public name -> the module that owns it.
 _OWNERS = {
     'EmpiricalPSF': 'field.empirical',
-    'CrowdedMixturePhotometry': 'crowded',
-    'InjectionResult': 'crowded',
-    'UnfinishedTilesError': 'crowded',
-    'inject_and_recover': 'crowded',
+    'CrowdedMixturePhotometry': 'crowded.photometry',
+    'InjectionResult': 'crowded.photometry',
+    'UnfinishedTilesError': 'crowded.photometry',
+    'inject_and_recover': 'crowded.photometry',
     'GriddedMixturePSF': 'psf.gridded',
     'PSFAssessment': 'psf.assessment',
     'assess_psf': 'psf.assessment',

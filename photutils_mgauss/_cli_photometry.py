@@ -106,7 +106,7 @@ def _sparse(image, psf, options):
 
 
 def _crowded(image, psf, options):
-    from photutils_mgauss.crowded import CrowdedMixturePhotometry
+    from photutils_mgauss.crowded.photometry import CrowdedMixturePhotometry
     photometry = CrowdedMixturePhotometry(
         psf, threshold=options.threshold or 4.5,
         effective_gain=image.noise.gain)

@@ -19,11 +19,11 @@ from photutils_mgauss import (
     _kernels,
     inject_and_recover,
 )
-from photutils_mgauss._crowded_plan import Plan
-from photutils_mgauss._crowded_sky import Mesh
-from photutils_mgauss._crowded_stars import Neighbours, Stars
-from photutils_mgauss._crowded_table import NOT_SEEN, REPEATED
-from photutils_mgauss._crowded_tile import Tile, TileJob, TileOptions
+from photutils_mgauss.crowded.background import Mesh
+from photutils_mgauss.crowded.plan import Plan
+from photutils_mgauss.crowded.stars import Neighbours, Stars
+from photutils_mgauss.crowded.table import NOT_SEEN, REPEATED
+from photutils_mgauss.crowded.tile import Tile, TileJob, TileOptions
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.image import Image
 

@@ -14,7 +14,7 @@ from photutils_mgauss import (
     _kernels,
     fit_mixture_field,
 )
-from photutils_mgauss.crowded import _local_psf
+from photutils_mgauss.crowded.photometry import _local_psf
 
 EDGES = np.arange(17, 26)
 MARGIN = 12

@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF, _kernels
-from photutils_mgauss.crowded import _local_psf
+from photutils_mgauss.crowded.photometry import _local_psf
 
 RADIUS = 24
 

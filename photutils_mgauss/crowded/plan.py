@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from photutils_mgauss._crowded_solve import solve_tile
-from photutils_mgauss._crowded_table import StarTable, tabulate
-from photutils_mgauss._crowded_tile import CELL, TileJob, TileOptions
+from photutils_mgauss.crowded.solve import solve_tile
+from photutils_mgauss.crowded.table import StarTable, tabulate
+from photutils_mgauss.crowded.tile import CELL, TileJob, TileOptions
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.image import Image
 from photutils_mgauss.utils.parallel import available_cores

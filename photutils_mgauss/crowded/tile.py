@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._crowded_sky import Mesh
-from photutils_mgauss._crowded_stars import Neighbours, Stars
+from photutils_mgauss.crowded.background import Mesh
+from photutils_mgauss.crowded.stars import Neighbours, Stars
 from photutils_mgauss.psf.local import MAX_WING
 
 # Fit stamps are 7 or 9 pixels wide, 13 for bright stars: almost all of the

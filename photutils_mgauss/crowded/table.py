@@ -5,7 +5,7 @@ import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._crowded_search import extended
+from photutils_mgauss.crowded.search import extended
 
 # Photutils' own bits.
 PARTIAL, OUTSIDE, NO_FLUX, NO_CONVERGENCE, NO_COVARIANCE = 1, 2, 4, 8, 16

@@ -1,10 +1,10 @@
 """The stars of a tile found and fitted, from first to last."""
 import numpy as np
 
-from photutils_mgauss._crowded_bright import seed_saturated, size_differences
-from photutils_mgauss._crowded_given import take_up, warm_up
-from photutils_mgauss._crowded_search import find, leave_out
-from photutils_mgauss._crowded_tile import REST, Tile
+from photutils_mgauss.crowded.bright import seed_saturated, size_differences
+from photutils_mgauss.crowded.given import take_up, warm_up
+from photutils_mgauss.crowded.search import find, leave_out
+from photutils_mgauss.crowded.tile import REST, Tile
 
 # Finding starts with the brightest stars.
 _FALLING = (80, 25, 10)

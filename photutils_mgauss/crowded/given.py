@@ -7,8 +7,8 @@ takes the star it means, and entries that mean none get one of their own.
 import numpy as np
 from scipy.spatial import cKDTree
 
-from photutils_mgauss._crowded_search import leave_out
-from photutils_mgauss._crowded_stars import Stars
+from photutils_mgauss.crowded.search import leave_out
+from photutils_mgauss.crowded.stars import Stars
 
 # A star further from its entry has to be this much brighter to be meant: a
 # factor of exp(d^2 / 2) at d times this distance [pix].

@@ -12,16 +12,12 @@ from astropy.nddata import NDData
 from astropy.table import QTable, Table, vstack
 from astropy.utils.exceptions import AstropyUserWarning
 
-from photutils_mgauss import _injection as injection
 from photutils_mgauss import _kernels
-from photutils_mgauss._crowded_plan import Plan, run
-from photutils_mgauss._crowded_table import (
-    REPEATED,
-    StarTable,
-    as_qtable,
-)
-from photutils_mgauss._crowded_tile import TileOptions
-from photutils_mgauss._injection import InjectionResult
+from photutils_mgauss.crowded import injection
+from photutils_mgauss.crowded.injection import InjectionResult
+from photutils_mgauss.crowded.plan import Plan, run
+from photutils_mgauss.crowded.table import REPEATED, StarTable, as_qtable
+from photutils_mgauss.crowded.tile import TileOptions
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.image import Image, find_gain
 from photutils_mgauss.utils.validation import (

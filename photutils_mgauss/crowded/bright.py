@@ -2,7 +2,7 @@
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from photutils_mgauss._crowded_stars import Stars
+from photutils_mgauss.crowded.stars import Stars
 
 # Groups of bad pixels of up to this many may hide a saturated star.
 _SATURATED_PIXELS = (2, 2000)

@@ -4,8 +4,8 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from photutils_mgauss import _kernels
-from photutils_mgauss._crowded_stars import Stars
-from photutils_mgauss._crowded_tile import CELL
+from photutils_mgauss.crowded.stars import Stars
+from photutils_mgauss.crowded.tile import CELL
 
 # Pixels where nine together stand out less than this fraction of the
 # threshold are not looked at.
