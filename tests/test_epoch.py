@@ -24,7 +24,7 @@ from motion_scenes import tan_wcs
 from numpy.testing import assert_allclose
 
 from photutils_mgauss import Epoch, barycentric_observer, invert_wcs
-from photutils_mgauss._epoch import read_epoch, sky_vectors
+from photutils_mgauss.motions.epoch import read_epoch, sky_vectors
 from photutils_mgauss.sky.observers import (
     add_aberration,
     observer_position,

@@ -4,7 +4,7 @@ import pytest
 from numpy.testing import assert_array_equal
 from scipy.spatial.distance import cdist
 
-from photutils_mgauss.matching import (
+from photutils_mgauss.motions.matching import (
     Tolerance,
     match_ids,
     match_positions,

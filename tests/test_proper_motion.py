@@ -494,7 +494,7 @@ def test_accelerations_are_found(rng):
 
 def test_a_known_perspective_acceleration_is_taken_out():
     """A nearby star that recedes: its motion slows down."""
-    from photutils_mgauss._references import perspective, read_catalogue
+    from photutils_mgauss.motions.references import perspective, read_catalogue
     star = Table({'id': [1], 'class': ['star'], 'ra': [269.45],
                   'dec': [4.69], 'pmra': [-801.6], 'pmdec': [10362.4],
                   'parallax': [546.98], 'radial_velocity': [-110.5],

@@ -30,9 +30,14 @@ from motion_scenes import (
 )
 
 from photutils_mgauss import Epoch, ProperMotionFitter
-from photutils_mgauss._joint import Priors, Problem, reduce_all, solve_all
-from photutils_mgauss.alignment import Gauge, solve_frames
-from photutils_mgauss.matching import Tolerance, match_positions
+from photutils_mgauss.motions.frames import Gauge, solve_frames
+from photutils_mgauss.motions.joint import (
+    Priors,
+    Problem,
+    reduce_all,
+    solve_all,
+)
+from photutils_mgauss.motions.matching import Tolerance, match_positions
 from photutils_mgauss.sky.observers import observer_position
 from photutils_mgauss.sky.tangent_plane import TangentPlane
 from photutils_mgauss.sky.transforms import Transform

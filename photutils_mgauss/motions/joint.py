@@ -37,7 +37,7 @@ from operator import add
 
 import numpy as np
 
-from photutils_mgauss._stacked import (
+from photutils_mgauss.motions.stacked import (
     apply,
     apply_transposed,
     gram,

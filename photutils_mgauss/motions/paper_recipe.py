@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from photutils_mgauss._fit_motions import Fit, build_problem
-from photutils_mgauss._joint import Priors, solve_all
-from photutils_mgauss._references import FIXED
-from photutils_mgauss.alignment import MOTIONS, POSITIONS, Frames
+from photutils_mgauss.motions.frames import MOTIONS, POSITIONS, Frames
+from photutils_mgauss.motions.joint import Priors, solve_all
+from photutils_mgauss.motions.loop import Fit, build_problem
+from photutils_mgauss.motions.references import FIXED
 from photutils_mgauss.sky.transforms import Transform
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri, ndtr
 
-from photutils_mgauss._stacked import invert_2x2
+from photutils_mgauss.motions.stacked import invert_2x2
 from photutils_mgauss.sky.transforms import Transform, fit_map
 
 SIGNIFICANT = 2.0  # standard deviations that call for a floor

@@ -12,18 +12,23 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from photutils_mgauss._assemble import (
+from photutils_mgauss.motions.assemble import (
     assemble,
     check_epochs,
     few_in_common,
     tie_planes,
 )
-from photutils_mgauss._bootstrap import bootstrap_frames, bootstrap_median
-from photutils_mgauss._corrected_wcs import Correction, correct_epoch
-from photutils_mgauss._epoch import Epoch
-from photutils_mgauss._fit_motions import Fit, Options, fit, prepare
-from photutils_mgauss._joint import Priors, solve_all
-from photutils_mgauss._motion_table import (
+from photutils_mgauss.motions.bootstrap import (
+    bootstrap_frames,
+    bootstrap_median,
+)
+from photutils_mgauss.motions.corrected_wcs import Correction, correct_epoch
+from photutils_mgauss.motions.epoch import Epoch
+from photutils_mgauss.motions.joint import Priors, solve_all
+from photutils_mgauss.motions.loop import Fit, Options, fit, prepare
+from photutils_mgauss.motions.matching import Tolerance
+from photutils_mgauss.motions.paper_recipe import fit_paper
+from photutils_mgauss.motions.tables import (
     FLAGS,
     alignment_table,
     residual_table,
@@ -31,8 +36,6 @@ from photutils_mgauss._motion_table import (
     star_table,
     validation_table,
 )
-from photutils_mgauss._paper_recipe import fit_paper
-from photutils_mgauss.matching import Tolerance
 from photutils_mgauss.sky.observers import julian_years, observer_velocity, tdb
 from photutils_mgauss.sky.transforms import Transform
 from photutils_mgauss.utils.validation import as_choice, as_integer, as_real

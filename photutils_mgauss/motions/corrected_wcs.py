@@ -25,7 +25,7 @@ from astropy.modeling.models import (
 )
 from astropy.wcs import WCS
 
-from photutils_mgauss._epoch import numbers, pixel_size
+from photutils_mgauss.motions.epoch import numbers, pixel_size
 from photutils_mgauss.sky.observers import remove_aberration
 from photutils_mgauss.sky.tangent_plane import TangentPlane, directions
 from photutils_mgauss.sky.transforms import exponents, monomials

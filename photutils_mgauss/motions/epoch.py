@@ -11,7 +11,7 @@ import numpy as np
 from astropy.coordinates import CartesianRepresentation
 from astropy.table import Table
 
-from photutils_mgauss._stacked import sandwich_2x2
+from photutils_mgauss.motions.stacked import sandwich_2x2
 from photutils_mgauss.sky.observers import (
     _known_observer,
     julian_years,

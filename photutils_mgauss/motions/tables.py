@@ -5,20 +5,16 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss._fit_motions import (
-    data_chi2,
-    measured,
-    prior_rank,
-)
-from photutils_mgauss._joint import (
+from photutils_mgauss.motions.joint import (
     CHUNK,
     cross_covariance,
     parallax_leak,
     parts,
     solve_all,
 )
-from photutils_mgauss._references import FIXED
-from photutils_mgauss._stacked import invert_2x2
+from photutils_mgauss.motions.loop import data_chi2, measured, prior_rank
+from photutils_mgauss.motions.references import FIXED
+from photutils_mgauss.motions.stacked import invert_2x2
 from photutils_mgauss.sky.observers import tdb
 from photutils_mgauss.sky.tangent_plane import directions
 from photutils_mgauss.utils.parallel import map_parallel

@@ -3,21 +3,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from photutils_mgauss._joint import (
-    Estimates,
-    Priors,
-    Problem,
-    reduce_all,
-    solve_all,
-)
-from photutils_mgauss._references import build_priors, perspective
-from photutils_mgauss._relative import (
-    Family,
-    mean_weights,
-    remove_mean_field,
-)
-from photutils_mgauss._stacked import invert_2x2
-from photutils_mgauss.alignment import (
+from photutils_mgauss.motions.frames import (
     Frames,
     Gauge,
     chi2_limit,
@@ -25,6 +11,20 @@ from photutils_mgauss.alignment import (
     solve_frames,
     worst_outliers,
 )
+from photutils_mgauss.motions.joint import (
+    Estimates,
+    Priors,
+    Problem,
+    reduce_all,
+    solve_all,
+)
+from photutils_mgauss.motions.references import build_priors, perspective
+from photutils_mgauss.motions.relative import (
+    Family,
+    mean_weights,
+    remove_mean_field,
+)
+from photutils_mgauss.motions.stacked import invert_2x2
 
 CONVERGED = 1e-3  # of the median error of a detection
 MAX_ITERATIONS = 40
@@ -185,7 +185,7 @@ def _with_references(scene):
 def _select(catalogue, which, n):
     """Return part of a catalogue; references by name are all quasars."""
     if catalogue is None:
-        from photutils_mgauss._references import UNKNOWN, Catalogue
+        from photutils_mgauss.motions.references import UNKNOWN, Catalogue
         return Catalogue(None, np.full(n, 'qso'), np.full((5, n), np.nan),
                          np.repeat(UNKNOWN * np.eye(5)[..., None], n, axis=2),
                          np.full(n, np.nan), np.full(n, np.nan))

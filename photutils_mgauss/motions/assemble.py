@@ -3,19 +3,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from photutils_mgauss._epoch import Epoch, plane_unit, read_epoch, sky_vectors
-from photutils_mgauss._references import (
-    Catalogue,
-    is_table,
-    read_catalogue,
+from photutils_mgauss.motions.epoch import (
+    Epoch,
+    plane_unit,
+    read_epoch,
+    sky_vectors,
 )
-from photutils_mgauss._stacked import sandwich_2x2
-from photutils_mgauss.alignment import tie_plane
-from photutils_mgauss.matching import (
+from photutils_mgauss.motions.frames import tie_plane
+from photutils_mgauss.motions.matching import (
     Matches,
     match_ids,
     match_positions,
 )
+from photutils_mgauss.motions.references import (
+    Catalogue,
+    is_table,
+    read_catalogue,
+)
+from photutils_mgauss.motions.stacked import sandwich_2x2
 from photutils_mgauss.sky.observers import observer_position
 from photutils_mgauss.sky.tangent_plane import TangentPlane
 
@@ -37,7 +42,7 @@ class Sightings:
     unit : {'mas', 'pix'}
     names : (n,) `~numpy.ndarray`
         Identifiers of the stars.
-    matches : `~photutils_mgauss.matching.Matches`
+    matches : `~photutils_mgauss.motions.matching.Matches`
     places : (2, E, n) `~numpy.ndarray`
         Measured positions, NaN where there are none.
     covariance : (3, E, n) `~numpy.ndarray`

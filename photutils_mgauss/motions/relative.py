@@ -17,8 +17,8 @@ from operator import add
 
 import numpy as np
 
-from photutils_mgauss._joint import eliminate, parts, scaled_rows
-from photutils_mgauss._stacked import gram
+from photutils_mgauss.motions.joint import eliminate, parts, scaled_rows
+from photutils_mgauss.motions.stacked import gram
 from photutils_mgauss.utils.parallel import map_parallel
 
 

@@ -11,9 +11,9 @@ import astropy.units as u
 import numpy as np
 from astropy.table import Table
 
-from photutils_mgauss._epoch import find_column, numbers
-from photutils_mgauss._joint import Priors
-from photutils_mgauss._stacked import apply
+from photutils_mgauss.motions.epoch import find_column, numbers
+from photutils_mgauss.motions.joint import Priors
+from photutils_mgauss.motions.stacked import apply
 from photutils_mgauss.sky.observers import julian_years
 from photutils_mgauss.sky.tangent_plane import unit_vectors
 

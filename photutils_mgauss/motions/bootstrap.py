@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photutils_mgauss._joint import eliminate, parts, scaled_rows
+from photutils_mgauss.motions.joint import eliminate, parts, scaled_rows
 from photutils_mgauss.utils.validation import as_floats, as_integer
 
 BATCH = 500  # resamplings worked on at a time
