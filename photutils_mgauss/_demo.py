@@ -22,7 +22,7 @@ from photutils_mgauss.field.selection import select_psf_stars
 from photutils_mgauss.motions.fitter import Epoch, ProperMotionFitter
 from photutils_mgauss.photometry.psf_photometry import MixturePSFPhotometry
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
-from photutils_mgauss.simulation import (
+from photutils_mgauss.simulation.scene import (
     Instrument,
     paper_exposures,
     simulate,

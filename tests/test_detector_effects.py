@@ -7,8 +7,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import label
 from test_simulation import SMALL, one_star
 
-from photutils_mgauss._detector_effects import bleed, pattern
-from photutils_mgauss.simulation import (
+from photutils_mgauss.simulation.effects import bleed, pattern
+from photutils_mgauss.simulation.scene import (
     DetectorEffects,
     Exposure,
     Instrument,

@@ -14,10 +14,10 @@ from astropy.wcs import WCS as FITSWCS
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import PSFPhotometry
 
-from photutils_mgauss._simulation_bound import covariances
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
-from photutils_mgauss.simulation import (
+from photutils_mgauss.simulation.bound import covariances
+from photutils_mgauss.simulation.scene import (
     CSST_BANDS,
     Band,
     DetectorEffects,

@@ -7,10 +7,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF
-from photutils_mgauss._brighter_fatter import photons
-from photutils_mgauss._simulation_brush import widen
-from photutils_mgauss._simulation_optics import _interpolation
-from photutils_mgauss.simulation import (
+from photutils_mgauss.simulation.brighter_fatter import photons
+from photutils_mgauss.simulation.brush import widen
+from photutils_mgauss.simulation.optics import _interpolation
+from photutils_mgauss.simulation.scene import (
     DetectorEffects,
     Exposure,
     Instrument,

@@ -9,8 +9,9 @@ from functools import partial
 
 import numpy as np
 
-from photutils_mgauss._brighter_fatter import shoot_stars
-from photutils_mgauss._detector_effects import (
+from photutils_mgauss.simulation.brighter_fatter import shoot_stars
+from photutils_mgauss.simulation.brush import brush_of
+from photutils_mgauss.simulation.effects import (
     SATURATED,
     DetectorEffects,
     add_cosmic_rays,
@@ -18,9 +19,8 @@ from photutils_mgauss._detector_effects import (
     pattern,
     respond,
 )
-from photutils_mgauss._simulation_brush import brush_of
-from photutils_mgauss._simulation_instrument import Instrument
-from photutils_mgauss._simulation_sky import Exposure
+from photutils_mgauss.simulation.exposures import Exposure
+from photutils_mgauss.simulation.instrument import Instrument
 from photutils_mgauss.utils.parallel import map_parallel
 
 # Rows that share a random stream. It is part of what a seed means.

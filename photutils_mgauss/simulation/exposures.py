@@ -35,8 +35,8 @@ from gwcs import WCS
 from gwcs import coordinate_frames as cf
 from numpy.polynomial import chebyshev, polynomial
 
-from photutils_mgauss._simulation_instrument import Band
-from photutils_mgauss._simulation_psf import band_of
+from photutils_mgauss.simulation.instrument import Band
+from photutils_mgauss.simulation.mock_psf import band_of
 from photutils_mgauss.utils.validation import as_floats, as_real
 
 _LIGHT_SPEED = 299792.458 * u.km / u.s

@@ -8,7 +8,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss._simulation_sky import NGP
+from photutils_mgauss.simulation.exposures import NGP
 from photutils_mgauss.utils.validation import (
     as_floats,
     as_integer,

@@ -15,29 +15,25 @@ import numpy as np
 from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import QTable
 
-from photutils_mgauss._detector_effects import DetectorEffects
-from photutils_mgauss._simulation_bound import (
+from photutils_mgauss.psf.gridded import GriddedMixturePSF
+from photutils_mgauss.simulation.bound import (
     SimulatedCatalogue,
     covariances,
     draw_table,
 )
-from photutils_mgauss._simulation_brush import brush_of, widen
-from photutils_mgauss._simulation_catalogues import (
+from photutils_mgauss.simulation.brush import brush_of, widen
+from photutils_mgauss.simulation.catalogues import (
     PAPER_DENSITY,
     crowded_field,
     sky_field,
     sparse_field,
 )
-from photutils_mgauss._simulation_image import Chip, draw, expose, read
-from photutils_mgauss._simulation_instrument import (
-    CSST_BANDS,
-    Band,
-    Instrument,
-)
-from photutils_mgauss._simulation_optics import Optics
-from photutils_mgauss._simulation_psf import csst_psf
-from photutils_mgauss._simulation_sky import Exposure, paper_exposures
-from photutils_mgauss.psf.gridded import GriddedMixturePSF
+from photutils_mgauss.simulation.effects import DetectorEffects
+from photutils_mgauss.simulation.exposures import Exposure, paper_exposures
+from photutils_mgauss.simulation.image import Chip, draw, expose, read
+from photutils_mgauss.simulation.instrument import CSST_BANDS, Band, Instrument
+from photutils_mgauss.simulation.mock_psf import csst_psf
+from photutils_mgauss.simulation.optics import Optics
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = [
@@ -163,7 +159,7 @@ class Scene:
         FileExistsError
             If a file is there and ``overwrite`` is not set.
         """
-        from photutils_mgauss._scene_files import write_scene
+        from photutils_mgauss.simulation.files import write_scene
         return write_scene(self, path, layout, overwrite)
 
 

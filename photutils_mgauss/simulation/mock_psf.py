@@ -7,9 +7,9 @@ size, an ellipticity and a coma that change smoothly over the detector.
 """
 import numpy as np
 
-from photutils_mgauss._simulation_instrument import CSST_BANDS
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.simulation.instrument import CSST_BANDS
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 # The PSF in g before the pixel: weights and standard deviations [pix].

@@ -13,8 +13,8 @@ from astropy.nddata import NDData
 from numpy.polynomial import chebyshev, polynomial
 from photutils.psf import GriddedPSFModel
 
-from photutils_mgauss._simulation_instrument import Band
-from photutils_mgauss._simulation_psf import band_of
+from photutils_mgauss.simulation.instrument import Band
+from photutils_mgauss.simulation.mock_psf import band_of
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 __doctest_requires__ = {'Optics': ['galsim']}
