@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 
 from photutils_mgauss import plotting
-from photutils_mgauss._plot_style import BLACK
 from photutils_mgauss._psf_files import psf_kind, psf_record, read_psf
 from photutils_mgauss._report_page import Panel, Section
+from photutils_mgauss.plotting.style import BLACK
 from photutils_mgauss.psf.shapes import adaptive_moments
 
 # Nodes that whiskers and maps show along each axis at most.

@@ -1,7 +1,7 @@
 """Figures of the Bayesian fit, on the Axes they are given."""
 import numpy as np
 
-from photutils_mgauss._plot_style import CYCLE
+from photutils_mgauss.plotting.style import CYCLE
 
 __all__ = [
     'plot_model_graph',

@@ -1,7 +1,7 @@
 """Figures of epochs and proper motions, on the Axes they are given."""
 import numpy as np
 
-from photutils_mgauss._plot_style import BLUE, ORANGE
+from photutils_mgauss.plotting.style import BLUE, ORANGE
 
 __all__ = [
     'plot_errors_by_epochs',

@@ -1,7 +1,7 @@
 """Figures of PSF fields, on the Axes they are given."""
 import numpy as np
 
-from photutils_mgauss._plot_style import VERMILION
+from photutils_mgauss.plotting.style import VERMILION
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.validation import as_choice, as_integer
 

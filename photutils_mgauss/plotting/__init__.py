@@ -1,13 +1,13 @@
 """Figures, drawn on the Axes they are given."""
-from photutils_mgauss._plot_field import plot_field
-from photutils_mgauss._plot_fit import (
+from photutils_mgauss.plotting.field import plot_field
+from photutils_mgauss.plotting.fit import (
     plot_comparison_of_numbers,
     plot_ellipses,
     plot_profile,
     plot_projection,
     plot_residual,
 )
-from photutils_mgauss._plot_grid import (
+from photutils_mgauss.plotting.grid import (
     plot_node_map,
     plot_psf_image,
     plot_shape_map,
@@ -15,18 +15,18 @@ from photutils_mgauss._plot_grid import (
     plot_width_map,
     plot_worst_node,
 )
-from photutils_mgauss._plot_motions import (
+from photutils_mgauss.plotting.motions import (
     plot_errors_by_epochs,
     plot_motion_errors,
     plot_proper_motions,
     plot_residual_vectors,
 )
-from photutils_mgauss._plot_posterior import (
+from photutils_mgauss.plotting.posterior import (
     plot_model_graph,
     plot_posterior,
     plot_trace,
 )
-from photutils_mgauss._plot_stars import (
+from photutils_mgauss.plotting.stars import (
     plot_comparison,
     plot_detections,
     plot_error_curve,

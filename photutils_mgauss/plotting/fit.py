@@ -1,7 +1,7 @@
 """Figures of a mixture and of the image it was fitted to, on given Axes."""
 import numpy as np
 
-from photutils_mgauss._plot_style import BLACK, BLUE, CYCLE, VERMILION
+from photutils_mgauss.plotting.style import BLACK, BLUE, CYCLE, VERMILION
 
 __all__ = [
     'plot_comparison_of_numbers',

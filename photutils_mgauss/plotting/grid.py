@@ -2,7 +2,7 @@
 import numpy as np
 from astropy.stats import mad_std
 
-from photutils_mgauss._plot_style import BLACK, BLUE, ORANGE
+from photutils_mgauss.plotting.style import BLACK, BLUE, ORANGE
 from photutils_mgauss.psf.shapes import adaptive_moments
 
 __all__ = [
