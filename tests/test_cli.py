@@ -15,7 +15,8 @@ from astropy.io import fits
 from astropy.table import QTable
 from astropy.wcs import WCS
 
-from photutils_mgauss import GriddedMixturePSF, __version__, _demo
+from photutils_mgauss import GriddedMixturePSF, __version__
+from photutils_mgauss.cli import demo as demonstration
 from photutils_mgauss.cli import main
 from photutils_mgauss.files.image_layers import read_wcs
 
@@ -74,8 +75,8 @@ def test_the_demonstration_recovers_the_true_motions(demo):
     folder, _ = demo
     stars = QTable.read(folder / 'motions.ecsv')
     stars = stars[np.isfinite(stars['pmra'].value)]
-    truth = _demo.Settings(n_epochs=3, size=512, n_stars=88,
-                           n_qsos=30).sources()
+    truth = demonstration.Settings(n_epochs=3, size=512, n_stars=88,
+                          n_qsos=30).sources()
     index, distance, _ = SkyCoord(stars['ra'], stars['dec']
                                   ).match_to_catalog_sky(
         SkyCoord(truth['ra'], truth['dec']))
@@ -259,7 +260,7 @@ def test_psfs_are_rewritten_and_used_in_the_other_format(chain, capsys):
     np.testing.assert_array_equal(one.scales, two.scales)
     np.testing.assert_array_equal(one.mixtures[3].covariances,
                                   two.mixtures[3].covariances)
-    from photutils_mgauss._psf_files import psf_record
+    from photutils_mgauss.cli.psf_files import psf_record
     assert psf_record(chain / 'same.asdf')['command'] == 'psf'
     assert capsys.readouterr().out == ''
 
@@ -395,7 +396,7 @@ def test_with_overwrite_what_exists_is_replaced(chain, monkeypatch):
 
 
 def test_a_file_that_fails_half_way_leaves_nothing(tmp_path):
-    from photutils_mgauss._cli_tools import whole_file
+    from photutils_mgauss.cli.tools import whole_file
     (tmp_path / 'a.txt').write_text('old')
     with pytest.raises(ValueError, match='half'), whole_file(  # noqa: PT012
             tmp_path / 'a.txt') as draft:
@@ -446,7 +447,7 @@ def test_the_version_is_told(capsys):
 
 
 def test_help_comes_without_loading_what_computes():
-    code = ('import sys, photutils_mgauss.cli as cli\n'
+    code = ('import sys, photutils_mgauss.cli.command as cli\n'
             'cli._parser().format_help()\n'
             'print(*sys.modules)')
     loaded = subprocess.run([sys.executable, '-c', code], check=True,

@@ -16,8 +16,8 @@ from photutils_mgauss import (
     GriddedMixturePSF,
     MultiGaussianPSFModel,
     UnfinishedTilesError,
-    _kernels,
     inject_and_recover,
+    kernels,
 )
 from photutils_mgauss.crowded.background import Mesh
 from photutils_mgauss.crowded.plan import Plan
@@ -176,8 +176,8 @@ def test_wings_are_those_of_the_exact_gaussian(rng):
                         1 / covariance[1, 1]])
         cx, cy = rng.uniform(-6, 46, 2)
         image = np.zeros((40, 40))
-        _kernels._add_wings(row[None], 1.0, cx, cy, False, 1e-6,
-                            np.empty((4, 40)), np.empty((3, 9)), image)
+        kernels.add_wings(row[None], 1.0, cx, cy, False, 1e-6,
+                          np.empty((4, 40)), np.empty((3, 9)), image)
         offset = np.stack([x - cx - 0.2, y - cy + 0.1], axis=-1)
         exact = 3 * np.exp(-0.5 * np.einsum(
             '...i,ij,...j', offset, np.linalg.inv(covariance), offset))
@@ -655,7 +655,7 @@ def test_the_solution_of_conjugate_gradients_solves_the_equations():
     full[15:, :15] = full[:15, 15:].T
     right = rng.normal(size=3 * n + 4)
     step, level = np.empty((n, 3)), np.empty(4)
-    _kernels.solve_joint(
+    kernels.solve_joint(
         matrix, right[:15].reshape(n, 3).copy(), indptr, j.astype(np.int64),
         blocks, node, share, reach, np.diag(full)[15:].copy(), 0.7, 2,
         right[15:].copy(), 1e-12, 200, step, level)

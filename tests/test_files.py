@@ -252,8 +252,8 @@ def test_asdf_finds_the_package_by_its_entry_points(tmp_path):
     code = f"""
 import sys, asdf
 sys.path[:0] = [{str(tmp_path)!r}, {str(ROOT)!r}]
-from photutils_mgauss import _asdf
-_asdf.extensions(), _asdf.resource_mappings()
+from photutils_mgauss.files import asdf_extension
+asdf_extension.extensions(), asdf_extension.resource_mappings()
 heavy = {{'photutils', 'numba', 'scipy', 'astropy.modeling'}}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
 asdf.open({str(tmp_path / 'b.asdf')!r}).close()

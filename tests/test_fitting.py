@@ -10,9 +10,9 @@ from scipy.optimize import least_squares
 from photutils_mgauss import (
     FitStatus,
     GaussianMixture,
-    _kernels,
     adaptive_moments,
     fit_mixture,
+    kernels,
 )
 from photutils_mgauss.fitting.phases import phase_error, phase_rows
 from photutils_mgauss.fitting.search import Workspace
@@ -94,13 +94,13 @@ def test_the_normal_equations_are_those_of_finite_differences(rng, n_rows):
     weight, stamp = rng.uniform(0.5, 2, shape), rng.normal(0, 1, shape)
     fluxes, space = np.empty(k), Workspace(k, shape)
     rows = rng.normal(0, 1, (n_rows, *shape))
-    _kernels.project(stamp, weight, centre, shapes, (0.0, 0.0), True, rows,
-                     fluxes, space.scratch)
+    kernels.project(stamp, weight, centre, shapes, (0.0, 0.0), True, rows,
+                    fluxes, space.scratch)
 
     def residual(values):
         images = np.empty((k, *shape))
-        _kernels.draw_unit(values[k:].reshape(k, 5), *centre,
-                           np.empty((4, shape[1])), images)
+        kernels.draw_unit(values[k:].reshape(k, 5), *centre,
+                          np.empty((4, shape[1])), images)
         model = np.tensordot(values[:k], images, 1)
         left = stamp - model
         return np.concatenate([(np.sqrt(weight) * left).ravel(),
@@ -111,8 +111,8 @@ def test_the_normal_equations_are_those_of_finite_differences(rng, n_rows):
     jacobian = np.array([residual(values + h) - residual(values - h)
                          for h in step]) / 2e-6
     matrix, gradient = np.empty((6 * k, 6 * k)), np.empty(6 * k)
-    _kernels.normal_equations(weight, centre, shapes, fluxes, (0.0, 0.0),
-                              rows, space.scratch, matrix, gradient)
+    kernels.normal_equations(weight, centre, shapes, fluxes, (0.0, 0.0),
+                             rows, space.scratch, matrix, gradient)
     assert_allclose(matrix, jacobian @ jacobian.T, rtol=1e-6,
                     atol=1e-7 * matrix.max())
     assert_allclose(gradient, -jacobian @ residual(values), rtol=1e-6,
@@ -125,11 +125,11 @@ def test_the_price_of_limits_has_the_slope_it_says(rng):
     limits = np.array([0.5, 1.0, 3.0, 4.0, 2.0])
     for shape in rng.normal(0, 4, (50, 5)):
         gradient = np.zeros(5)
-        _kernels.penalty(shape, limits, np.zeros((5, 5)), gradient)
+        kernels.penalty(shape, limits, np.zeros((5, 5)), gradient)
         step = 1e-6 * np.eye(5)
         rest = np.zeros((5, 5)), np.zeros(5)
-        slope = [(_kernels.penalty(shape + h, limits, *rest)
-                  - _kernels.penalty(shape - h, limits, *rest)) / 2e-6
+        slope = [(kernels.penalty(shape + h, limits, *rest)
+                  - kernels.penalty(shape - h, limits, *rest)) / 2e-6
                  for h in step]
         assert_allclose(gradient, -np.array(slope) / 2, rtol=1e-5, atol=1e-5)
 
@@ -442,7 +442,7 @@ def test_astrometric_weighting_needs_more_than_native_pixels():
 def test_gaussians_are_drawn_as_they_are_defined(tilt, width, mean):
     shapes = np.array([[*mean, -np.log(width), tilt, -np.log(1.3 * width)]])
     images = np.empty((1, 23, 40))
-    _kernels.draw_unit(shapes, 19.5, 11.0, np.empty((4, 40)), images)
+    kernels.draw_unit(shapes, 19.5, 11.0, np.empty((4, 40)), images)
     y, x = np.indices(images.shape[1:])
     u, v = x - 19.5 - mean[0], y - 11.0 - mean[1]
     exponent = (u / width + tilt * v)**2 + (v / (1.3 * width))**2

@@ -10,12 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from psf_grids import make_grid, some_mixture
 from strategies import SETTINGS, numbers
 
-from photutils_mgauss import (
-    GaussianMixture,
-    GriddedMixturePSF,
-    _kernels,
-    blend,
-)
+from photutils_mgauss import GaussianMixture, GriddedMixturePSF, blend, kernels
 
 Y, X = np.mgrid[:15, :15]
 
@@ -358,9 +353,9 @@ def test_a_large_grid_is_small_in_memory(rng):
 def test_the_exponential_function_is_exact_to_the_last_digit(rng):
     x = np.concatenate([-rng.uniform(0, 688, 100_000), [0, -1e-300, -688]])
     out = np.empty(x.size)
-    _kernels.exponentials(x, out)
+    kernels.exponentials(x, out)
     assert_allclose(out, np.exp(x), rtol=3e-16)
     extremes = np.array([-700, -1e5, -1e300, -np.inf, np.nan])
     out = np.empty(5)
-    _kernels.exponentials(extremes, out)
+    kernels.exponentials(extremes, out)
     assert_array_equal(out, [0, 0, 0, 0, np.nan])

@@ -10,7 +10,7 @@ from astropy.time import Time
 from numpy.testing import assert_allclose
 
 from photutils_mgauss import Instrument, paper_exposures
-from photutils_mgauss._images import Reading, read_image
+from photutils_mgauss.cli.star_image import Reading, read_image
 from photutils_mgauss.files.image_header import (
     Cards,
     electrons_in_unit,

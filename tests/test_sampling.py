@@ -4,11 +4,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from photutils_mgauss import GaussianMixture, sample_mixture
-from photutils_mgauss.fitting.posterior import (
-    effective_size,
-    relabel,
-    split_r_hat,
-)
+from photutils_mgauss.fitting.convergence import effective_size, split_r_hat
+from photutils_mgauss.fitting.posterior import relabel
 
 TRUTH = GaussianMixture.from_stddevs(
     [0.65, 0.35], [[0.1, 0], [-0.2, 0.1]], [[1, 1.2], [2.4, 2.1]], [0.1, -0.2])

@@ -8,8 +8,8 @@ from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF
 from photutils_mgauss.simulation.brighter_fatter import photons
-from photutils_mgauss.simulation.brush import widen
 from photutils_mgauss.simulation.optics import _interpolation
+from photutils_mgauss.simulation.renderer import widen
 from photutils_mgauss.simulation.scene import (
     DetectorEffects,
     Exposure,

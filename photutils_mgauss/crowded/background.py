@@ -1,7 +1,7 @@
 """The background of a tile of a crowded field: a mesh of nodes."""
 import numpy as np
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.psf.local import cells
 
 # How strongly neighbouring nodes are tied, in units of a node's information.
@@ -54,8 +54,8 @@ class Mesh:
     def sums(self, weight, residual, background, clip):
         """Return the sums (3, n) over nodes' pixels of `mesh_sums`."""
         out = np.empty((self.size, 3))
-        _kernels.mesh_sums(weight, residual, background, *self._owner,
-                           self.shape[1], clip, out)
+        kernels.mesh_sums(weight, residual, background, *self._owner,
+                          self.shape[1], clip, out)
         return out.T.copy()
 
     def n_ties(self):

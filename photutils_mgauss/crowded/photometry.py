@@ -12,7 +12,7 @@ from astropy.nddata import NDData
 from astropy.table import QTable, Table, vstack
 from astropy.utils.exceptions import AstropyUserWarning
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.crowded import injection
 from photutils_mgauss.crowded.injection import InjectionResult
 from photutils_mgauss.crowded.plan import Plan, run
@@ -444,9 +444,9 @@ def _draw(psf, x, y, flux, shape, psf_shape):
     rows, count = psf.rows_at(x, y)
     left, bottom = (np.rint(v).astype(np.int64) for v in (x, y))
     faintest = 1e-7 * max(np.abs(flux).max(initial=0), 1e-300)
-    _kernels.add_stars(np.arange(x.size), 1.0, x, y, flux, left, bottom, one,
-                       0 * one, wing.astype(np.int64), np.empty((3, 1)),
-                       rows, count, psf.integrated, faintest, image)
+    kernels.add_stars(np.arange(x.size), 1.0, x, y, flux, left, bottom, one,
+                      0 * one, wing.astype(np.int64), np.empty((3, 1)),
+                      rows, count, psf.integrated, faintest, image)
     return image
 
 

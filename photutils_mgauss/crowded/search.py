@@ -3,7 +3,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.crowded.tile import CELL
 
@@ -49,12 +49,12 @@ def _scores(tile, threshold):
     light = tile.options.psf_error * np.maximum(tile.star_light(), 0)
     weight = np.divide(tile.weight, 1 + tile.weight * light**2)
     for j, i in np.ndindex(tile.templates.shape[:2]):
-        _kernels.score(
+        kernels.score(
             tile.residual, weight, tile.templates[j, i], i * CELL,
             min((i + 1) * CELL, nx), j * CELL, min((j + 1) * CELL, ny),
             _HINT * threshold, significance, flux)
     s, p = tile.stars, tile.pairs
-    _kernels.score_beside(
+    kernels.score_beside(
         s.x, s.y, s.flux, *tile._place(), tile.jets, tile.matrix,
         tile.gradient, p.indptr, p.neighbour, tile.blocks, tile.templates,
         CELL, tile.weight, tile.residual, light, _REACH, _LEAST,

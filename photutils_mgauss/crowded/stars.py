@@ -3,7 +3,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 
 # Stars further apart than this are not solved for together [pix]; they still
 # see each other through the residual.
@@ -78,11 +78,11 @@ class Neighbours:
         place = (x, y, _PAIR_DISTANCE, cell, columns, start,
                  np.argsort(cell, kind='stable'))
         count = np.empty(x.size, np.int64)
-        _kernels.count_near(*place, count)
+        kernels.count_near(*place, count)
         indptr = np.concatenate([[0], np.cumsum(count)])
         neighbour, twin = np.empty((2, indptr[-1]), np.int64)
         gap = np.empty(indptr[-1])
-        _kernels.list_near(*place, indptr, neighbour, gap, twin)
+        kernels.list_near(*place, indptr, neighbour, gap, twin)
         has = count > 0
         nearest, distance = np.full(x.size, -1), np.full(x.size, np.inf)
         nearest[has] = neighbour[indptr[:-1][has]]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.crowded.search import extended
 
 # Photutils' own bits.
@@ -137,8 +137,8 @@ def _with_repeats(table, tile):
 def _quality(tile):
     s = tile.stars
     out = np.empty((len(s), 6))
-    _kernels.star_quality(s.flux, s.x, s.y, *tile._place(), tile.jets,
-                          tile.weight, tile.residual, tile.star_light(), out)
+    kernels.star_quality(s.flux, s.x, s.y, *tile._place(), tile.jets,
+                         tile.weight, tile.residual, tile.star_light(), out)
     return out
 
 

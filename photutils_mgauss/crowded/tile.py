@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.crowded.background import Mesh
 from photutils_mgauss.crowded.stars import Neighbours, Stars
 from photutils_mgauss.psf.local import MAX_WING
@@ -225,15 +225,15 @@ class Tile:
 
     def _draw_stamps(self, chosen):
         s = self.stars
-        _kernels.star_stamps(chosen, s.x, s.y, *self._place(), s.rows,
-                             s.paces, s.count, self.psf.integrated, self.jets)
+        kernels.star_stamps(chosen, s.x, s.y, *self._place(), s.rows,
+                            s.paces, s.count, self.psf.integrated, self.jets)
 
     def _add_stars(self, chosen, sign):
         s = self.stars
-        _kernels.add_stars(chosen, sign, s.x, s.y, s.flux, *self._place(),
-                           self.wing, self.jets, s.rows, s.count,
-                           self.psf.integrated, _FAINTEST * self.noise,
-                           self.residual)
+        kernels.add_stars(chosen, sign, s.x, s.y, s.flux, *self._place(),
+                          self.wing, self.jets, s.rows, s.count,
+                          self.psf.integrated, _FAINTEST * self.noise,
+                          self.residual)
 
     def background(self):
         """Return the image of the background."""
@@ -268,10 +268,10 @@ class Tile:
         self.gradient, self.reach = np.empty((n, 3)), np.empty((n, 3))
         self.blocks = np.empty((p.neighbour.size, 3, 3))
         place = (*self._place(), self.jets)
-        _kernels.own_equations(s.flux, *place, self.weight, self.residual,
-                               self.matrix, self.gradient, self.reach)
-        _kernels.pair_blocks(p.indptr, p.neighbour, p.twin, s.flux, *place,
-                             self.weight, self.blocks)
+        kernels.own_equations(s.flux, *place, self.weight, self.residual,
+                              self.matrix, self.gradient, self.reach)
+        kernels.pair_blocks(p.indptr, p.neighbour, p.twin, s.flux, *place,
+                            self.weight, self.blocks)
         self._hold()
         self._expect()
         self._form_background_equations()
@@ -323,7 +323,7 @@ class Tile:
         step = np.empty((len(s), 3))
         level_step = np.empty(self.level.size)
         matrix = self.matrix * (1 + damping * np.eye(3))
-        _kernels.solve_joint(
+        kernels.solve_joint(
             matrix, self.gradient, p.indptr, p.neighbour, self.blocks,
             *self._own_node(), self.reach, self.mesh_diagonal, self.tie,
             self.mesh.shape[1], self.mesh_gradient, _TOLERANCE, _CG_STEPS,
@@ -402,9 +402,9 @@ class Tile:
         p = self.pairs
         covariance = np.empty((len(self.stars), 3, 3))
         correlation = np.empty(len(self.stars))
-        _kernels.joint_covariances(self.matrix, p.indptr, p.neighbour,
-                                   self.blocks, p.nearest, covariance,
-                                   correlation)
+        kernels.joint_covariances(self.matrix, p.indptr, p.neighbour,
+                                  self.blocks, p.nearest, covariance,
+                                  correlation)
         return covariance, correlation
 
 

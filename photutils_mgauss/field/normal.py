@@ -20,7 +20,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.field.forms import rows_of
 from photutils_mgauss.utils.parallel import available_cores
 
@@ -176,7 +176,7 @@ class _PartEquations:
             now = self.coefficients, basis[part], local[part]
             rows = rows_of(*self.form.shapes(*now))
             n = 3 * sources.shape[1] + 6 * rows.shape[1] - 1
-            _kernels.field_normal(
+            kernels.field_normal(
                 data[part], weights[part], corners[part], basis[part], rows,
                 self.form.jacobians(*now), sources[part], anchors[part],
                 hold[part], n_sources[part], sky[part], self.fit_sky,
@@ -190,8 +190,8 @@ def model_stamps(problem, coefficients):
     out = np.empty_like(problem.stamps.data)
     rows = rows_of(*problem.form.shapes(coefficients, problem.basis,
                                         problem.local))
-    _kernels.field_model(problem.stamps.corners, rows, problem.sources,
-                         problem.n_sources, problem.sky, out)
+    kernels.field_model(problem.stamps.corners, rows, problem.sources,
+                        problem.n_sources, problem.sky, out)
     return out
 
 
@@ -333,5 +333,5 @@ def _damped_step(matrix, right, damping):
     scaled[np.diag_indices_from(scaled)] += damping
     # Not LAPACK: its own threads wait for each other on a busy machine.
     step = np.empty(right.size)
-    _kernels.solve(np.column_stack([scaled, right / scale]), step)
+    kernels.solve(np.column_stack([scaled, right / scale]), step)
     return step / scale

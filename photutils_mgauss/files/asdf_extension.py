@@ -18,10 +18,10 @@ _BASE = 'asdf://photutils_mgauss/'
 
 # Public class -> the module that defines it.
 CLASSES = {
-    'GaussianMixture': 'mixture',
-    'GriddedMixturePSF': 'gridded',
-    'MixtureField': 'field',
-    'MultiGaussianPSFModel': 'model',
+    'GaussianMixture': 'psf.mixture',
+    'GriddedMixturePSF': 'psf.gridded',
+    'MixtureField': 'field.mixture_field',
+    'MultiGaussianPSFModel': 'psf.model',
 }
 
 

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.fitting.search import (
     Problem,
     Stamp,
@@ -480,8 +480,8 @@ def _judge(solution, stamp):
         return FitStatus.VANISHED
     if solution.stopped:
         return FitStatus.STOPPED
-    price = sum(_kernels.penalty(shape, stamp.limits, np.empty((5, 5)),
-                                 np.empty(5)) for shape in solution.shapes)
+    price = sum(kernels.penalty(shape, stamp.limits, np.empty((5, 5)),
+                                np.empty(5)) for shape in solution.shapes)
     return FitStatus.AT_LIMIT if price > 0 else FitStatus.CONVERGED
 
 

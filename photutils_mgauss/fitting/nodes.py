@@ -14,16 +14,14 @@ A shift that is the same at all phases is a matter of definition; half the
 range over the phases is the error.
 """
 import numpy as np
-from astropy.table import QTable
 from scipy.ndimage import map_coordinates, spline_filter
 from tqdm.auto import tqdm
 
 from photutils_mgauss.fitting.image import fit_mixture
+from photutils_mgauss.psf.grid import plain_report
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.parallel import available_cores
 from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
-
-__all__ = ['fit_nodes', 'plain_report']
 
 # Phases of the star within a pixel, along each axis.
 _PHASES = 4
@@ -129,20 +127,6 @@ def _report(nodes, images, mask, fits, radius, executor):
     table['status'] = [int(fit.status) for fit in fits]
     table['message'] = [fit.message for fit in fits]
     return table
-
-
-def plain_report(positions, n_components, scales):
-    """Return the table of mixtures that were given, not fitted."""
-    n = len(positions)
-    nan = np.full(n, np.nan)
-    return QTable({
-        'id': np.arange(1, n + 1), 'x': positions[:, 0].astype(float),
-        'y': positions[:, 1].astype(float),
-        'n_components': np.array(n_components, int), 'scale': scales,
-        'chi2': nan, 'size_error': nan, 'ellipticity_error': nan, 'e1': nan,
-        'e2': nan, 'phase_error': nan, 'enclosed_flux': nan,
-        'bridged': np.zeros(n, bool), 'status': np.full(n, -1),
-        'message': np.full(n, 'The mixture was given, not fitted.')})
 
 
 def _phase_error(nodes, fit, radius):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.fitting.phases import phase_rows
 from photutils_mgauss.psf.mixture import GaussianMixture
 
@@ -68,6 +68,7 @@ class Problem(NamedTuple):
 
     @property
     def n_parameters(self):
+        """How many numbers a fit has."""
         per_gaussian = 4 if self.fixed else 6
         return self.n_components * per_gaussian - self.tied
 
@@ -120,6 +121,7 @@ class Stamp(NamedTuple):
 
     @classmethod
     def prepare(cls, image, weight, peak, problem):
+        """Return an image as the kernels fit it, scaled and centred."""
         used = weight > 0
         pixels = np.where(used, image, 0.0)
         scale = pixels.max()
@@ -180,8 +182,9 @@ class Trials(NamedTuple):
 
     @property
     def best(self):
+        """The start that came lowest."""
         return Solution(self.shapes[0], self.fluxes[0], float(self.costs[0]),
-                        bool(self.statuses[0] == _kernels.FIT_STOPPED))
+                        bool(self.statuses[0] == kernels.FIT_STOPPED))
 
 
 def run(stamp, problem, spaces, shapes, max_steps=_MAX_STEPS):
@@ -194,7 +197,7 @@ def _run_all(stamp, problem, spaces, starts, max_steps):
     n, k = starts.shape[:2]
     trials = Trials(starts.copy(), np.empty((n, k)), np.empty(n), np.empty(n))
     space = spaces[k]
-    _kernels.fit_starts(
+    kernels.fit_starts(
         stamp.pixels, stamp.weight, stamp.centre, trials.shapes,
         trials.fluxes, stamp.tie, problem.signed, stamp.rows, problem.fixed,
         stamp.limits, _TOLERANCE, max_steps, space.scratch, space.matrices,
@@ -362,6 +365,7 @@ def narrow_first(solution):
 
 
 def mixture_of(solution, problem, centre):
+    """Return a solution as a mixture about the origin, in native pixels."""
     pitch = problem.pitch
     x, y, log_l, t, log_m = solution.shapes.T
     length, m = np.exp(log_l), np.exp(log_m)
@@ -376,7 +380,7 @@ def mixture_of(solution, problem, centre):
 def draw_model(solution, weights, stamp, space):
     """Return the mixture of unit flux on the stamp's pixels."""
     images, lanes = space.scratch[0], space.scratch[7]
-    _kernels.draw_unit(solution.shapes, *stamp.centre, lanes[:4], images)
+    kernels.draw_unit(solution.shapes, *stamp.centre, lanes[:4], images)
     return np.tensordot(weights, images, 1)
 
 
@@ -389,13 +393,13 @@ def covariance_of(problem, stamp, solution, space):
     """
     n = problem.n_components
     matrix, gradient = np.empty((6 * n, 6 * n)), np.empty(6 * n)
-    _kernels.project(stamp.pixels, stamp.weight, stamp.centre,
-                     solution.shapes, stamp.tie, problem.signed,
-                     stamp.rows[:0], solution.fluxes.copy(), space.scratch)
-    _kernels.normal_equations(
+    kernels.project(stamp.pixels, stamp.weight, stamp.centre,
+                    solution.shapes, stamp.tie, problem.signed,
+                    stamp.rows[:0], solution.fluxes.copy(), space.scratch)
+    kernels.normal_equations(
         stamp.weight, stamp.centre, solution.shapes, solution.fluxes,
         stamp.tie, stamp.rows[:0], space.scratch, matrix, gradient)
-    _kernels.add_penalties(solution.shapes, stamp.limits, matrix, gradient)
+    kernels.add_penalties(solution.shapes, stamp.limits, matrix, gradient)
     # From fluxes first to Gaussian by Gaussian.
     place = np.column_stack([np.arange(n),
                              np.arange(n, 6 * n).reshape(n, 5)]).ravel()

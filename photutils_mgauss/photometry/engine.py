@@ -13,13 +13,13 @@ from functools import partial
 import numpy as np
 from tqdm.auto import tqdm
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.model import MultiGaussianPSFModel
 from photutils_mgauss.utils.parallel import map_parallel
 
-CONVERGED = (_kernels._CONVERGED, _kernels._STALLED)
-BAD_ERROR = _kernels._BAD_ERROR
+CONVERGED = (kernels.CONVERGED, kernels.STALLED)
+BAD_ERROR = kernels.BAD_ERROR
 
 # Stars (of groups: boxes times stars) handed to a thread at a time: a tenth
 # of a second, so that an interrupt is soon seen.
@@ -92,7 +92,7 @@ def psf_arrays(model):
     rows, x_grid, y_grid = (_as_kernels_take(a, np.float64)
                             for a in (rows, x_grid, y_grid))
     paces = np.empty((*rows.shape[:2], 4))
-    _kernels.paces(rows, paces)
+    kernels.strides(rows, paces)
     return rows, paces, x_grid, y_grid, model.pixel_integrated
 
 
@@ -138,7 +138,7 @@ def count_pixels(image, boxes):
     if image.mask.size == 0:
         return boxes[:, 2] * boxes[:, 3]
     out = np.empty(len(boxes), np.int64)
-    _kernels.count_pixels(image.mask, boxes, out)
+    kernels.count_pixels(image.mask, boxes, out)
     return out
 
 
@@ -223,6 +223,7 @@ class Fits:
 
     @property
     def arrays(self):
+        """All arrays, in the order in which the kernel fills them."""
         return (self.values, self.sky, self.covariances, self.sums,
                 self.outcome)
 
@@ -239,7 +240,7 @@ class Fits:
 
 def _fit_chunk(image, psf, fit_sky, max_iterations, stars):
     fits = Fits.empty(len(stars.initial))
-    _kernels.fit_stars(
+    kernels.fit_stars(
         image.data, image.error, image.mask, stars.starts, stars.boxes,
         stars.initial, stars.sky, stars.lower, stars.upper, stars.fixed,
         bool(fit_sky), image.gain, psf, max_iterations, *fits.arrays)

@@ -15,7 +15,7 @@ import numpy as np
 from astropy.modeling.fitting import fitter_unit_support
 from scipy.linalg import cho_solve, cholesky
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.psf.base import PSFModel
 from photutils_mgauss.utils import compat
 from photutils_mgauss.utils.validation import as_integer
@@ -338,11 +338,11 @@ def _minimize(problem, max_steps):
         length = state.length(_undamped(problem, state, step, damping))
         gain, fall = _gain(state, new, step), state.chi2 - new.chi2
         state = new
-        if _kernels._remainder(length, last) < _TOLERANCE:
+        if kernels.remainder(length, last) < _TOLERANCE:
             return state, 3, n + 2
-        last, damping = length, _kernels._next_damping(
+        last, damping = length, kernels.next_damping(
             damping, gain)
-    status = 2 if fall < _kernels._LEAST_FALL * state.chi2 else 0
+    status = 2 if fall < kernels.LEAST_FALL * state.chi2 else 0
     return state, status, max_steps + 1
 
 
@@ -352,7 +352,7 @@ def _gain(state, new, step):
     if expected > 1e-9 * state.chi2:
         return (state.chi2 - new.chi2) / expected
     # Of a smaller fall nothing is left after rounding: keep the damping.
-    return _kernels._POOR_GAIN
+    return kernels.POOR_GAIN
 
 
 def _undamped(problem, state, step, damping):

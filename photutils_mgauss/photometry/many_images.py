@@ -19,7 +19,7 @@ from astropy.coordinates import SkyCoord
 from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import QTable
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.photometry.engine import (
     Image,
     cut_boxes,
@@ -261,7 +261,7 @@ class _Images:
         values = np.column_stack([flux, np.where(seen[:, None], xy, 0.0)])
         chi2, pixels = np.empty(n), np.empty(n, np.int64)
         matrix, gradient = np.empty((n, 3, 3)), np.empty((n, 3))
-        _kernels.star_equations(
+        kernels.star_equations(
             image.data, image.error, image.mask, self.boxes[k], values,
             self.psfs[k], chi2, pixels, matrix, gradient)
         if (pixels < 0).any():
@@ -411,12 +411,12 @@ def _gain(state, trial, step):
     # Of a smaller fall nothing is left after rounding: keep the damping.
     known = expected > 1e-9 * state.chi2
     return np.divide(state.chi2 - trial.chi2, expected, where=known,
-                     out=np.full(len(step), _kernels._POOR_GAIN))
+                     out=np.full(len(step), kernels.POOR_GAIN))
 
 
 def _next_damping(damping, gain):
     """Do what the kernel of one fit does, for many stars."""
-    return np.array([_kernels._next_damping(*pair)
+    return np.array([kernels.next_damping(*pair)
                      for pair in zip(damping, gain, strict=True)])
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from photutils.utils import calc_total_error
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.photometry.engine import cut_boxes, psf_arrays
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
@@ -54,7 +54,7 @@ def background_error(*, sky=0, read_noise=0, gain=1, exposure_time=None):
 
     Examples
     --------
-    >>> from photutils_mgauss.noise import background_error
+    >>> from photutils_mgauss.photometry import background_error
     >>> float(background_error(sky=96, read_noise=2))
     10.0
     """
@@ -240,7 +240,7 @@ class _Jets:
     def star(self, i, box):
         """Return the jet (3, pixels) of star i in a box."""
         out = np.empty((3, box[2] * box[3]))
-        _kernels.star_jet(self.x[i], self.y[i], box, self.psf, out)
+        kernels.star_jet(self.x[i], self.y[i], box, self.psf, out)
         return out
 
     def own(self, i):

@@ -55,10 +55,12 @@ class FitResult:
 
     @property
     def converged(self):
+        """Whether each fit ended at a minimum."""
         return np.isin(self.outcome[:, 0], CONVERGED)
 
     @property
     def has_covariance(self):
+        """Whether the errors of each fit are known."""
         first = int(np.argmax(self.free))
         return np.isfinite(self.covariances[:, first, first])
 

@@ -1,4 +1,13 @@
-"""Figures, drawn on the Axes they are given."""
+"""
+All figures, drawn on the Axes they are given.
+
+One module for each kind of result: `fit` shows a mixture beside the image it
+was fitted to, `grid` a PSF over a detector, `field` a field and its stars,
+`posterior` the draws of PyMC, `stars` measured stars, and `motions` epochs
+and proper motions; `style` has their colours. Every function imports
+matplotlib when it is called, takes the numbers it draws as public objects or
+tables, computes none itself, and leaves saving and showing to the caller.
+"""
 from photutils_mgauss.plotting.field import plot_field
 from photutils_mgauss.plotting.fit import (
     plot_comparison_of_numbers,

@@ -13,14 +13,12 @@ from functools import cached_property
 from itertools import count
 
 import numpy as np
+from astropy.table import QTable
 from scipy.optimize import linear_sum_assignment
 
-from photutils_mgauss import _kernels
-from photutils_mgauss.psf.mixture import (
-    GaussianMixture,
-    _check_covariances,
-    _rows,
-)
+from photutils_mgauss import kernels
+from photutils_mgauss.psf.mixture import GaussianMixture, _check_covariances
+from photutils_mgauss.psf.rows import kernel_rows
 from photutils_mgauss.utils.validation import as_floats
 
 __all__ = ['Grid', 'make_grid']
@@ -53,8 +51,8 @@ class Grid:
     serial: int = field(init=False)
 
     def __post_init__(self):
-        rows = _rows(self.weights * self.scales[:, None], self.means,
-                     self.covariances)
+        rows = kernel_rows(self.weights * self.scales[:, None], self.means,
+                           self.covariances)
         object.__setattr__(self, 'rows', np.ascontiguousarray(rows))
         object.__setattr__(self, 'serial', next(_serial))
         for array in self.arrays:
@@ -89,8 +87,8 @@ class Grid:
     def neighbours(self, x, y):
         """Return the indices and bilinear weights (4,) at a position."""
         index, weights = np.empty(4, np.int64), np.empty((3, 4))
-        _kernels.blend_weights(float(x), float(y), self.x_grid, self.y_grid,
-                               index, weights)
+        kernels.blend_weights(float(x), float(y), self.x_grid, self.y_grid,
+                              index, weights)
         used = weights[0] > 0
         return index[used], weights[0, used]
 
@@ -320,3 +318,17 @@ def checked_arrays(x, y, weights, means, covariances, scales):
         raise ValueError(msg)
     _check_covariances(covariances.reshape(-1, 2, 2), 'covariances')
     return Grid(x_grid, y_grid, weights, means, covariances, scales)
+
+
+def plain_report(positions, n_components, scales):
+    """Return the table of mixtures that were given, not fitted."""
+    n = len(positions)
+    nan = np.full(n, np.nan)
+    return QTable({
+        'id': np.arange(1, n + 1), 'x': positions[:, 0].astype(float),
+        'y': positions[:, 1].astype(float),
+        'n_components': np.array(n_components, int), 'scale': scales,
+        'chi2': nan, 'size_error': nan, 'ellipticity_error': nan, 'e1': nan,
+        'e2': nan, 'phase_error': nan, 'enclosed_flux': nan,
+        'bridged': np.zeros(n, bool), 'status': np.full(n, -1),
+        'message': np.full(n, 'The mixture was given, not fitted.')})

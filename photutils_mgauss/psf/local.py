@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 
 MAX_WING = 60
 # A cell's families are merged if that changes no pixel by more than this
@@ -119,8 +119,8 @@ class LocalPSF:
 
     def _stamp(self, rows, count):
         stamp = np.zeros((17, 17))
-        _kernels.render(rows[0, :count[0]], 8.0, 8.0, 1.0, self.integrated,
-                        stamp)
+        kernels.render(rows[0, :count[0]], 8.0, 8.0, 1.0, self.integrated,
+                       stamp)
         return stamp
 
     def rows_at(self, x, y):
@@ -158,15 +158,15 @@ class LocalPSF:
     def paces(rows):
         """Return what the kernels' walks over Gaussians need beside rows."""
         out = np.empty((*rows.shape[:2], 4))
-        _kernels.paces(rows, out)
+        kernels.strides(rows, out)
         return out
 
     def stamp(self, x, y, half):
         """Draw a star of unit flux in the middle of a stamp."""
         rows, count = self.rows_at(np.array([float(x)]), np.array([float(y)]))
         out = np.zeros((2 * half + 1, 2 * half + 1))
-        _kernels.render(rows[0, :count[0]], float(half), float(half), 1.0,
-                        self.integrated, out)
+        kernels.render(rows[0, :count[0]], float(half), float(half), 1.0,
+                       self.integrated, out)
         return out
 
 

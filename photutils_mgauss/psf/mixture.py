@@ -10,10 +10,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import erf
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.files.storage import storable
+from photutils_mgauss.psf.integrals import polar_integral
+from photutils_mgauss.psf.rows import kernel_rows
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = ['GaussianMixture', 'Moments', 'blend']
@@ -177,7 +178,7 @@ class GaussianMixture:
     @cached_property
     def rows(self):
         """The (K, 6) rows *amplitude, x, y, p, s, q* that kernels sum."""
-        return _rows(self.weights, self.means, self.covariances)
+        return kernel_rows(self.weights, self.means, self.covariances)
 
     def evaluate(self, x, y, *, pixel_integrated=False):
         """
@@ -207,7 +208,7 @@ class GaussianMixture:
         """
         x, y, shape = _points(x, y)
         out = np.empty(x.size)
-        _kernels.evaluate(x, y, self.rows, bool(pixel_integrated), out)
+        kernels.evaluate(x, y, self.rows, bool(pixel_integrated), out)
         return out.reshape(shape)[()]
 
     def gradient(self, x, y, *, pixel_integrated=False):
@@ -235,7 +236,7 @@ class GaussianMixture:
         """
         x, y, shape = _points(x, y)
         out = np.empty((2, x.size))
-        _kernels.gradient(x, y, self.rows, bool(pixel_integrated), out)
+        kernels.gradient(x, y, self.rows, bool(pixel_integrated), out)
         return np.moveaxis(out.reshape(2, *shape), 0, -1)
 
     def render(self, shape, x_0, y_0, *, flux=1, pixel_integrated=False):
@@ -272,8 +273,8 @@ class GaussianMixture:
         99.99940394918846
         """
         out = np.zeros(as_shape(shape, 'shape'))
-        _kernels.render(self.rows, as_real(x_0, 'x_0'), as_real(y_0, 'y_0'),
-                        as_real(flux, 'flux'), bool(pixel_integrated), out)
+        kernels.render(self.rows, as_real(x_0, 'x_0'), as_real(y_0, 'y_0'),
+                       as_real(flux, 'flux'), bool(pixel_integrated), out)
         return out
 
     def moments(self):
@@ -342,9 +343,9 @@ class GaussianMixture:
             msg = f'radius must not be negative or NaN, got {radius.min()}'
             raise ValueError(msg)
         finite = np.where(np.isfinite(radius), radius, 0).ravel()
-        energy = _polar_integral(self, finite, 64)
+        energy = polar_integral(self, finite, 64)
         for n_angles in 2 ** np.arange(7, 18):
-            coarse, energy = energy, _polar_integral(self, finite, n_angles)
+            coarse, energy = energy, polar_integral(self, finite, n_angles)
             if np.abs(energy - coarse).max(initial=0) < 1e-10:
                 break
         energy = energy.reshape(radius.shape)
@@ -539,18 +540,6 @@ def _points(x, y):
     return x.ravel(), y.ravel(), x.shape
 
 
-def _rows(weights, means, covariances):
-    """Return the kernels' rows; leading axes are free, (..., K, 6)."""
-    sxx, sxy, syy = (covariances[..., 0, 0], covariances[..., 0, 1],
-                     covariances[..., 1, 1])
-    slope = sxy / syy
-    p = 1 / (sxx - slope * sxy)
-    q = 1 / syy
-    amplitude = weights * np.sqrt(p * q) / (2 * np.pi)
-    return np.stack([amplitude, means[..., 0], means[..., 1], p, slope, q],
-                    axis=-1)
-
-
 def _unit_sum(weights):
     precision = getattr(np.asarray(weights), 'dtype', np.dtype(float))
     weights = as_floats(weights, 'weights', shape=(None,))
@@ -594,29 +583,3 @@ def _kernel_covariance(covariance):
                f'{covariance.tolist()}')
         raise ValueError(msg)
     return covariance
-
-
-def _polar_integral(mixture, radius, n_angles):
-    """
-    Integrate the mixture over discs of the radii (n,), in n_angles steps.
-
-    Along a ray u the exponent is -(a r^2 - 2 b r + c) / 2 with a = u.P.u,
-    b = u.P.m, c = m.P.m, which r dr integrates to exponentials and erf.
-    """
-    angle = 2 * np.pi * np.arange(n_angles) / n_angles
-    ray = np.stack([np.cos(angle), np.sin(angle)])
-    total = np.zeros((radius.size, n_angles))
-    precisions = np.linalg.inv(mixture.covariances)
-    for w, m, p in zip(mixture.weights, mixture.means, precisions,
-                       strict=True):
-        a = np.einsum('it,ij,jt->t', ray, p, ray)
-        h = (m @ p @ ray) / a
-        peak = np.exp(-0.5 * (m @ p @ m - a * h**2))
-        root = np.sqrt(a / 2)
-        r = radius[:, None]
-        inside = ((np.exp(-0.5 * a * h**2)
-                   - np.exp(-0.5 * a * (r - h) ** 2)) / a
-                  + h * np.sqrt(np.pi) / (2 * root)
-                  * (erf(root * (r - h)) + erf(root * h)))
-        total += w * np.sqrt(np.linalg.det(p)) / (2 * np.pi) * peak * inside
-    return total.mean(axis=1) * 2 * np.pi

@@ -10,7 +10,7 @@ The weights of K Gaussians are held as K - 1 stick-breaking fractions
 """
 import numpy as np
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.files.storage import storable
 from photutils_mgauss.psf.base import (
     PARAMETER_COLUMNS,
@@ -227,7 +227,7 @@ class MultiGaussianPSFModel(PSFModel):
         dy = np.subtract(y, y_0, dtype=float)
         (dx, dy), lattice = flat_points(dx, dy)
         out = np.empty(dx.size)
-        _kernels.evaluate(dx, dy, rows, self._pixel_integrated, out)
+        kernels.evaluate(dx, dy, rows, self._pixel_integrated, out)
         return with_unit(flux * out.reshape(lattice), unit)
 
     def fit_deriv(self, x, y, flux, x_0, y_0, *shape):
@@ -264,13 +264,13 @@ class MultiGaussianPSFModel(PSFModel):
 
     def _position_derivatives(self, dx, dy, flux, rows):
         out = np.empty((3, dx.size))
-        _kernels.evaluate(dx, dy, rows, self._pixel_integrated, out[0])
-        _kernels.gradient(dx, dy, rows, self._pixel_integrated, out[1:])
+        kernels.evaluate(dx, dy, rows, self._pixel_integrated, out[0])
+        kernels.gradient(dx, dy, rows, self._pixel_integrated, out[1:])
         return [out[0], -flux * out[1], -flux * out[2]]
 
     def _all_derivatives(self, dx, dy, flux, shape, free):
         jets = np.empty((self._n_components, 6, dx.size))
-        _kernels.jets(dx, dy, shape.unit_rows, self._pixel_integrated, jets)
+        kernels.jets(dx, dy, shape.unit_rows, self._pixel_integrated, jets)
         value, gx, gy = np.tensordot(shape.weights, jets[:, :3], 1)
         columns = [value, -flux * gx, -flux * gy]
         columns += list(flux * shape.weight_slopes() @ jets[:, 0])
@@ -295,6 +295,7 @@ class MultiGaussianPSFModel(PSFModel):
                    name=str(model['name'][0]) or None, **keywords)
 
     def _half_size(self):
+        """Half the width and height of the bounding box [pix]."""
         shape = _Shape(self._shape_parameters)
         reach = np.abs(shape.means) + self.bbox_factor * shape.stddevs
         return reach.max(axis=0) + 0.5 * self._pixel_integrated
@@ -369,7 +370,7 @@ def _rows_of(parameters):
     """Return the kernels' rows (K, 6) of shape parameters."""
     values = _numbers(parameters)
     rows = np.empty(((values.size + 1) // 6, 6))
-    _kernels.model_rows(values, _MIN_STDDEV, _MAX_RHO, rows)
+    kernels.model_rows(values, _MIN_STDDEV, _MAX_RHO, rows)
     return rows
 
 

@@ -12,7 +12,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.parallel import map_chunks
 from photutils_mgauss.utils.validation import as_floats, as_shape, as_stack
@@ -283,8 +283,8 @@ def _measure_images(images, used, variance):
     pixels = np.where(used, images, 0.0)
     sums, status = np.empty((len(images), 6)), np.empty(len(images), np.int64)
     largest = float(4 * (images.shape[1]**2 + images.shape[2]**2))
-    _kernels.adapt_to_images(pixels, used, states, _TOLERANCE, _MAX_STEPS,
-                             largest, sums, status)
+    kernels.adapt_to_images(pixels, used, states, _TOLERANCE, _MAX_STEPS,
+                            largest, sums, status)
     status[~finite] = ShapeStatus.NOT_FINITE
     noise = np.full((len(images), 5), np.nan)
     for i in np.flatnonzero((status == 0) & np.isfinite(variance[:, 0, 0])):
@@ -341,8 +341,8 @@ def _measure_mixtures(mixtures):
         state = np.array([[*moments.mean, spread[0, 0], spread[0, 1],
                            spread[1, 1]]])
         sums, status = np.empty((1, 6)), np.empty(1, np.int64)
-        _kernels.adapt_to_mixtures(table[None], state, _TOLERANCE, _MAX_STEPS,
-                                   np.inf, sums, status)
+        kernels.adapt_to_mixtures(table[None], state, _TOLERANCE, _MAX_STEPS,
+                                  np.inf, sums, status)
         row[:] = np.concatenate([state[0], sums[0, :1], [np.nan] * 5, status])
     return rows
 

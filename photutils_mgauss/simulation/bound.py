@@ -17,7 +17,7 @@ import numpy as np
 from astropy.table import QTable
 from astropy.time import Time
 
-from photutils_mgauss.simulation.brush import brush_of
+from photutils_mgauss.simulation.renderer import brush_of
 from photutils_mgauss.utils.parallel import map_chunks
 
 # Half the side of the stamps, and the step of the derivatives [pix].

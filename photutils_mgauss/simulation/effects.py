@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.utils.validation import as_integer, as_real
 
 # Bits of the flags of a pixel.
@@ -193,7 +193,7 @@ def bleed(electrons, full_well):
     overfull = np.flatnonzero((electrons > full_well).any(axis=0))
     for part in np.array_split(overfull, max(1, overfull.size // 256)):
         columns = np.ascontiguousarray(electrons[:, part].T, dtype=float)
-        _kernels.bleed(columns, float(full_well))
+        kernels.bleed(columns, float(full_well))
         electrons[:, part] = columns.T
 
 

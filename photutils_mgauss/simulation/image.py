@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 
 from photutils_mgauss.simulation.brighter_fatter import shoot_stars
-from photutils_mgauss.simulation.brush import brush_of
 from photutils_mgauss.simulation.effects import (
     SATURATED,
     DetectorEffects,
@@ -21,6 +20,7 @@ from photutils_mgauss.simulation.effects import (
 )
 from photutils_mgauss.simulation.exposures import Exposure
 from photutils_mgauss.simulation.instrument import Instrument
+from photutils_mgauss.simulation.renderer import brush_of
 from photutils_mgauss.utils.parallel import map_parallel
 
 # Rows that share a random stream. It is part of what a seed means.

@@ -21,7 +21,6 @@ from photutils_mgauss.simulation.bound import (
     covariances,
     draw_table,
 )
-from photutils_mgauss.simulation.brush import brush_of, widen
 from photutils_mgauss.simulation.catalogues import (
     PAPER_DENSITY,
     crowded_field,
@@ -34,6 +33,7 @@ from photutils_mgauss.simulation.image import Chip, draw, expose, read
 from photutils_mgauss.simulation.instrument import CSST_BANDS, Band, Instrument
 from photutils_mgauss.simulation.mock_psf import csst_psf
 from photutils_mgauss.simulation.optics import Optics
+from photutils_mgauss.simulation.renderer import brush_of, widen
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = [

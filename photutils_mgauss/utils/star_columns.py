@@ -19,6 +19,7 @@ class Sources:
 
 
 def read_sources(stars):
+    """Return x, y and, where there is one, the flux of a table of stars."""
     if not isinstance(stars, Table):
         msg = f'stars must be an astropy Table, got {type(stars).__name__}'
         raise TypeError(msg)

@@ -16,12 +16,8 @@ import time
 import numpy as np
 from psf_stamps import make_stamps
 
-from photutils_mgauss.fitting.posterior import (
-    effective_size,
-    relabel,
-    sample_mixture,
-    split_r_hat,
-)
+from photutils_mgauss.fitting.convergence import effective_size, split_r_hat
+from photutils_mgauss.fitting.posterior import relabel, sample_mixture
 
 PIXEL_SCALE = 0.074
 NAMES = ('omega', 'alpha', 'beta', 'gamma')

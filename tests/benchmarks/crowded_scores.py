@@ -9,11 +9,7 @@ from astropy.table import Table
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
-from photutils_mgauss import (
-    GriddedMixturePSF,
-    _kernels,
-    fit_mixture_field,
-)
+from photutils_mgauss import GriddedMixturePSF, fit_mixture_field, kernels
 from photutils_mgauss.crowded.photometry import _local_psf
 
 EDGES = np.arange(17, 26)
@@ -107,12 +103,12 @@ def bounds(psf, truth, variance):
              np.rint(y).astype(np.int64) - half,
              np.full(n, width), np.arange(n) * width**2)
     jets = np.empty((3, n * width**2))
-    _kernels.star_stamps(np.arange(n), x, y, *place, rows,
-                         local.paces(rows), count, local.integrated, jets)
+    kernels.star_stamps(np.arange(n), x, y, *place, rows,
+                        local.paces(rows), count, local.integrated, jets)
     fisher = np.empty((n, 3, 3))
-    _kernels.own_equations(flux, *place, jets, 1 / variance,
-                           np.zeros(variance.shape), fisher,
-                           np.empty((n, 3)), np.empty((n, 3)))
+    kernels.own_equations(flux, *place, jets, 1 / variance,
+                          np.zeros(variance.shape), fisher,
+                          np.empty((n, 3)), np.empty((n, 3)))
     diagonal = np.diagonal(np.linalg.inv(fisher), axis1=1, axis2=2)
     return np.sqrt(diagonal[:, 1:])
 

@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-from photutils_mgauss import GaussianMixture, GriddedMixturePSF, _kernels
+from photutils_mgauss import GaussianMixture, GriddedMixturePSF, kernels
 from photutils_mgauss.crowded.photometry import _local_psf
 
 RADIUS = 24
@@ -43,10 +43,10 @@ class CallablePSF:
         # crowdsource centres stamps on the pixel numpy.round names.
         left, bottom = (np.round(v).astype(np.int64) - half for v in (x, y))
         jets = np.empty((3, n * width**2))
-        _kernels.star_stamps(np.arange(n), x, y, left, bottom,
-                             np.full(n, width), np.arange(n) * width**2,
-                             rows, self.psf.paces(rows), count,
-                             self.psf.integrated, jets)
+        kernels.star_stamps(np.arange(n), x, y, left, bottom,
+                            np.full(n, width), np.arange(n) * width**2,
+                            rows, self.psf.paces(rows), count,
+                            self.psf.integrated, jets)
         return jets.reshape(3, n, width, width)
 
     def render_model(self, x, y, stampsz=None):

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from photutils_mgauss import plotting
-from photutils_mgauss._psf_files import psf_kind, psf_record, read_psf
-from photutils_mgauss._report_page import Panel, Section
+from photutils_mgauss.cli.page import Panel, Section
+from photutils_mgauss.cli.psf_files import psf_kind, psf_record, read_psf
 from photutils_mgauss.plotting.style import BLACK
 from photutils_mgauss.psf.shapes import adaptive_moments
 
@@ -215,7 +215,7 @@ _TABLES = (({'pmra', 'pmra_error'}, motion_section),
 
 def section_of(path):
     """Return the section on a result, or None for any other file."""
-    from photutils_mgauss._cli_tools import read_table
+    from photutils_mgauss.cli.tools import read_table
     path = Path(path)
     if path.suffix not in ('.ecsv', '.fits', '.asdf', '.psf'):
         return None

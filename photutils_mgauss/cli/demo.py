@@ -16,7 +16,7 @@ from photutils.background import Background2D
 from photutils.detection import DAOStarFinder
 from scipy.spatial import cKDTree
 
-from photutils_mgauss._cli_tools import whole_file
+from photutils_mgauss.cli.tools import whole_file
 from photutils_mgauss.field.mixture_field import fit_mixture_field
 from photutils_mgauss.field.selection import select_psf_stars
 from photutils_mgauss.motions.fitter import Epoch, ProperMotionFitter

@@ -3,7 +3,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from photutils_mgauss import _cli_tools as tools
+from photutils_mgauss.cli import tools
 
 
 def add(commands):
@@ -38,21 +38,21 @@ def run(options):
                '--overwrite')
         raise FileExistsError(msg)
     folder.mkdir(parents=True, exist_ok=True)
-    from photutils_mgauss import _demo
+    from photutils_mgauss.cli import demo
 
     def progress(steps, words):
         return tqdm(steps, desc=f'{words:10}', unit='epoch',
                     disable=options.quiet)
 
-    sources, scenes = _demo.take_images(_settings(options, _demo), progress)
+    sources, scenes = demo.take_images(_settings(options, demo), progress)
     if options.images_only:
-        paths = _demo.write_images(scenes, sources, folder)
+        paths = demo.write_images(scenes, sources, folder)
     else:
-        measured = [_demo.measure(scene)
+        measured = [demo.measure(scene)
                     for scene in progress(scenes, 'measure')]
-        result = _demo.find_motions(measured, sources)
-        paths = _demo.write(result, folder) + _draw(options, result, folder)
-        tools.say(options, *_demo.summary(result))
+        result = demo.find_motions(measured, sources)
+        paths = demo.write(result, folder) + _draw(options, result, folder)
+        tools.say(options, *demo.summary(result))
     tools.say(options, '', f'{len(paths)} files in {folder}')
 
 
@@ -70,10 +70,10 @@ def _draw(options, result, folder):
     except ImportError:
         tools.say(options, 'no figures: matplotlib is not installed')
         return []
-    from photutils_mgauss import _demo
+    from photutils_mgauss.cli import demo
     paths = []
-    for name, plot in (('positions', _demo.plot_positions),
-                       ('motions', _demo.plot_motions)):
+    for name, plot in (('positions', demo.plot_positions),
+                       ('motions', demo.plot_motions)):
         figure = Figure(figsize=(9, 4), layout='constrained')
         plot(result, figure.subplots(1, 2))
         paths.append(folder / f'{name}.png')

@@ -2,7 +2,7 @@
 from importlib.util import find_spec
 from pathlib import Path
 
-from photutils_mgauss import _cli_tools as tools
+from photutils_mgauss.cli import tools
 
 
 def add(commands):
@@ -43,7 +43,7 @@ def run(options):
 
 
 def _write(options, sections, output):
-    from photutils_mgauss._report_page import html_page
+    from photutils_mgauss.cli.page import html_page
     page = html_page(options.title, sections, tools.record_of(options))
     with tools.whole_file(output) as draft:
         draft.write_text(page, encoding='utf-8')
@@ -63,7 +63,7 @@ def _files(inputs):
 
 
 def _section(path, named, step):
-    from photutils_mgauss._report_sections import section_of
+    from photutils_mgauss.cli.sections import section_of
     step(f'read {path}')
     section = section_of(path)
     if section is None and named:

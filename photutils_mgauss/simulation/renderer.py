@@ -12,7 +12,7 @@ from astropy.nddata import NDData
 from photutils.psf import GriddedPSFModel
 from scipy.ndimage import gaussian_filter, spline_filter
 
-from photutils_mgauss import _kernels
+from photutils_mgauss import kernels
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 
 
@@ -38,7 +38,7 @@ class MixtureBrush:
         reach = np.zeros_like(flux)
         for height, sigma in zip(peak, stddev, strict=True):
             ratio = np.maximum(np.abs(flux) * height / faintest,
-                               1 / _kernels._DEPTH)
+                               1 / kernels.DEPTH)
             reach = np.maximum(reach, sigma * np.sqrt(2 * np.log(ratio)))
         return reach + offset + 1
 
@@ -46,9 +46,9 @@ class MixtureBrush:
         """Add stars (3, n), the rows x, y and flux, to out (ny, nx)."""
         x, y, flux = np.ascontiguousarray(stars)
         grid = self.psf._grid
-        kernel, nodes = ((_kernels.render_image, grid.rows)
+        kernel, nodes = ((kernels.render_image, grid.rows)
                          if self.psf.interpolation == 'blend' else
-                         (_kernels.render_matched_image, grid.sums))
+                         (kernels.render_matched_image, grid.sums))
         kernel(x, y, flux, nodes, grid.x_grid, grid.y_grid,
                self.psf.pixel_integrated, float(faintest), float(left),
                float(bottom), out)
@@ -105,7 +105,7 @@ class ImageBrush:
         # The profile falls; find the first distance it is too faint at. The
         # rings of bright stars end with the table.
         level = np.maximum(faintest / np.maximum(np.abs(flux), 1e-300),
-                           _kernels._DEPTH * self._profile[0] * 0.1)
+                           kernels.DEPTH * self._profile[0] * 0.1)
         steps = np.searchsorted(-self._profile, -level)
         return np.minimum(steps + 1, int(self._half)).astype(float)
 
@@ -113,9 +113,9 @@ class ImageBrush:
         """Add stars (3, n), the rows x, y and flux, to out (ny, nx)."""
         x, y, flux = np.ascontiguousarray(stars)
         table, x_grid, y_grid = self._table
-        _kernels.render_epsfs(x, y, flux, self.reach(flux, faintest), table,
-                              x_grid, y_grid, float(self._oversampling),
-                              float(left), float(bottom), out)
+        kernels.render_epsfs(x, y, flux, self.reach(flux, faintest), table,
+                             x_grid, y_grid, float(self._oversampling),
+                             float(left), float(bottom), out)
 
 
 def brush_of(psf):

@@ -2,7 +2,7 @@
 import os
 from pathlib import Path
 
-from photutils_mgauss import _cli_tools as tools
+from photutils_mgauss.cli import tools
 
 _SUFFIXES = ('.ecsv', '.fits')
 
@@ -70,7 +70,7 @@ def run(options):
 
 
 def _read_psf(path):
-    from photutils_mgauss._psf_files import read_psf
+    from photutils_mgauss.cli.psf_files import read_psf
     return read_psf(path)
 
 

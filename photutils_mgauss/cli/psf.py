@@ -1,5 +1,5 @@
 """``mgauss psf``: images or PSF files to grids of mixtures."""
-from photutils_mgauss import _cli_tools as tools
+from photutils_mgauss.cli import tools
 
 _SUFFIXES = ('.fits', '.asdf')
 
@@ -76,7 +76,7 @@ def run(options):
 
 def _make(options, path, read, step):
     """Return the grid of one input, and what is to be said of it."""
-    from photutils_mgauss._psf_files import psf_kind
+    from photutils_mgauss.cli.psf_files import psf_kind
     step(f'read {path}')
     kind = psf_kind(path)
     if kind == 'image' and options.oversampling is None:
@@ -90,7 +90,7 @@ def _make(options, path, read, step):
 
 def from_file(path, options):
     """Return the grid a PSF file becomes."""
-    from photutils_mgauss._psf_files import read_psf
+    from photutils_mgauss.cli.psf_files import read_psf
     number = options.n_components
     if number == 'auto':
         msg = f'{path}: --n-components must be a number for PSF files'
@@ -156,7 +156,7 @@ def _no_stars(image, stars):
 
 def write(psf, name, record):
     """Write a grid, whole or not at all."""
-    from photutils_mgauss._psf_files import write_psf
+    from photutils_mgauss.cli.psf_files import write_psf
     with tools.whole_file(name) as draft:
         write_psf(psf, draft, record)
 

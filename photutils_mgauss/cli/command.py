@@ -5,16 +5,10 @@ import warnings
 
 from tqdm import tqdm
 
-from photutils_mgauss import (
-    __version__,
-    _cli_demo,
-    _cli_motions,
-    _cli_photometry,
-    _cli_psf,
-    _cli_report,
-)
+from photutils_mgauss import __version__
+from photutils_mgauss.cli import demo_command, motions, photometry, psf, report
 
-_COMMANDS = (_cli_psf, _cli_photometry, _cli_motions, _cli_report, _cli_demo)
+_COMMANDS = (psf, photometry, motions, report, demo_command)
 
 _EPILOG = """\
 From two images to proper motions and a page that shows them:

@@ -162,7 +162,7 @@ def check_inputs(paths):
 
 def read_images(options, paths):
     """Return a function that reads image i as the options say."""
-    from photutils_mgauss._images import Reading, read_image
+    from photutils_mgauss.cli.star_image import Reading, read_image
     n = len(paths)
     files = {name: one_each(getattr(options, name), n, name)
              for name in ('error', 'weight', 'flags', 'wcs')}

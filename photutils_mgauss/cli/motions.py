@@ -2,9 +2,8 @@
 import json
 from pathlib import Path
 
-from photutils_mgauss import _cli_photometry as photometry
-from photutils_mgauss import _cli_psf as psf_command
-from photutils_mgauss import _cli_tools as tools
+from photutils_mgauss.cli import photometry, tools
+from photutils_mgauss.cli import psf as psf_command
 
 _TABLE_SUFFIXES = ('.ecsv', '.csv', '.txt', '.dat', '.vot', '.xml', '.votable')
 
@@ -182,7 +181,7 @@ def _from_catalogue(options, i):
 
 def _wcs_of(options, i, record):
     """Return the WCS named by an option, or that of the record's image."""
-    from photutils_mgauss._images import Reading, read_image
+    from photutils_mgauss.cli.star_image import Reading, read_image
     from photutils_mgauss.files.image_layers import read_wcs
     given = tools.one_each(options.wcs, len(options.inputs), 'wcs')[i]
     if given is not None:

@@ -1,0 +1,46 @@
+"""Grids of mixtures fitted to the PSFs of other programs."""
+import numpy as np
+
+from photutils_mgauss.fitting.node_images import (
+    of_gridded_psf,
+    of_image_psf,
+    of_psfex,
+)
+from photutils_mgauss.fitting.nodes import fit_nodes
+from photutils_mgauss.psf.grid import make_grid
+from photutils_mgauss.psf.gridded import GriddedMixturePSF
+
+
+def fit_gridded_psf(psf, n_components, **kwargs):
+    """See `GriddedMixturePSF.from_gridded_psf`."""
+    return _fitted(of_gridded_psf(psf), n_components, **kwargs)
+
+
+def fit_psfex(path, n_components, *, grid_shape, limits, contexts, **kwargs):
+    """See `GriddedMixturePSF.from_psfex`."""
+    nodes = of_psfex(path, grid_shape, limits=limits, contexts=contexts)
+    return _fitted(nodes, n_components, scaled=False, **kwargs)
+
+
+def fit_image_psf(psf, n_components, *, grid_xypos, **kwargs):
+    """See `GriddedMixturePSF.from_image_psf`."""
+    return _fitted(of_image_psf(psf, grid_xypos), n_components, **kwargs)
+
+
+def _fitted(nodes, n_components, *, scaled=True, interpolation='blend',
+            outside='clamp', **kwargs):
+    """Fit images and return the grid with the report of the fits."""
+    mixtures, scales, report = fit_nodes(nodes, n_components, **kwargs)
+    if not any(mixtures):
+        msg = ('psf must have at least one image that can be fitted, but '
+               f'all failed, the first: {report["message"][0]}')
+        raise ValueError(msg)
+    grid, order = make_grid(mixtures, nodes.positions,
+                            scales if scaled else None)
+    report = report[order]
+    report['id'] = np.arange(1, len(report) + 1)
+    report['bridged'] = [mixtures[i] is None for i in order]
+    report['scale'] = grid.scales
+    report['n_components'] = (grid.weights != 0).sum(axis=1)
+    return GriddedMixturePSF._of_grid(
+        grid, report, interpolation=interpolation, outside=outside)

@@ -1,0 +1,84 @@
+r"""
+The only loops over pixels, compiled with numba.
+
+One module a subject: `gaussian` has one Gaussian at one point, `rows` a walk
+along a pixel row, `tile` and `image` patches and whole images, `grid` mixtures
+at the nodes of a detector grid, and each kind of fit its own. Arrays are
+float64 and C-contiguous, results go into arrays that are passed in, and
+nothing is raised: the rooms above check arguments first and spread work over
+threads. `jit` is the only module that names numba. Whoever adds a loop over
+pixels adds it here, with the shapes of its arrays in the docstring, and lists
+what other rooms may call below; they write ``kernels.NAME``.
+
+A Gaussian of covariance :math:`\Sigma` is handed over as a row of six
+numbers, *amplitude, x, y, p, s, q*: its peak value, its centre, and the
+factors of its exponent when :math:`x` is conditioned on :math:`y`,
+
+.. math::
+
+    g = A \exp\left[-\tfrac12 \left(p\,(x - s y)^2 + q\,y^2\right)\right],
+    \quad q = 1 / \Sigma_{yy},\ s = \Sigma_{xy} / \Sigma_{yy},\
+    p = \Sigma_{yy} / \det\Sigma .
+
+This form loses no digits to cancellation when the Gaussian is thin and
+tilted, and it is what a walk along a pixel row needs.
+"""
+from photutils_mgauss.utils.lazy import hand_on
+
+__getattr__, __dir__, __all__ = hand_on(__name__, {
+    'add_stars': 'crowded_fit',
+    'add_wings': 'crowded_fit',
+    'count_near': 'crowded_fit',
+    'joint_covariances': 'crowded_fit',
+    'list_near': 'crowded_fit',
+    'mesh_sums': 'crowded_fit',
+    'own_equations': 'crowded_fit',
+    'pair_blocks': 'crowded_fit',
+    'solve_joint': 'crowded_fit',
+    'star_stamps': 'crowded_fit',
+    'score': 'crowded_search',
+    'score_beside': 'crowded_search',
+    'star_quality': 'crowded_search',
+    'LEAST_FALL': 'descent',
+    'POOR_GAIN': 'descent',
+    'next_damping': 'descent',
+    'remainder': 'descent',
+    'field_model': 'field_fit',
+    'field_normal': 'field_fit',
+    'evaluate': 'gaussian',
+    'exponentials': 'gaussian',
+    'gradient': 'gaussian',
+    'jets': 'gaussian',
+    'model_rows': 'gaussian',
+    'blend_weights': 'grid',
+    'differentiate_grid': 'grid',
+    'differentiate_matched': 'grid',
+    'evaluate_grid': 'grid',
+    'evaluate_matched': 'grid',
+    'render_grid': 'grid',
+    'render_matched': 'grid',
+    'DEPTH': 'image',
+    'bleed': 'image',
+    'render_epsfs': 'image',
+    'render_image': 'image',
+    'render_matched_image': 'image',
+    'solve': 'linear',
+    'adapt_to_images': 'moments',
+    'adapt_to_mixtures': 'moments',
+    'render': 'rows',
+    'FIT_STOPPED': 'stamp_fit',
+    'add_penalties': 'stamp_fit',
+    'draw_unit': 'stamp_draw',
+    'fit_starts': 'stamp_fit',
+    'normal_equations': 'stamp_fit',
+    'penalty': 'stamp_fit',
+    'project': 'stamp_fit',
+    'BAD_ERROR': 'star_fit',
+    'CONVERGED': 'star_fit',
+    'STALLED': 'star_fit',
+    'count_pixels': 'star_fit',
+    'fit_stars': 'star_fit',
+    'star_equations': 'star_fit',
+    'star_jet': 'star_fit',
+    'strides': 'tile',
+})

@@ -1,0 +1,253 @@
+"""A field of mixtures fitted to the stamps of stars."""
+from math import exp, sqrt
+
+import numpy as np
+
+from photutils_mgauss.kernels.gaussian import LOG_NOTHING
+from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.linear import _back_substitute, _eliminate
+from photutils_mgauss.kernels.rows import render
+
+# A field of mixtures fitted to the stamps of n stars.
+#
+# shapes (K, 6) are the numbers that vary over the detector: log weight, x, y,
+# log_p, s, log_q with p = exp(2 log_p), q = exp(2 log_q), so that any values
+# are a valid mixture. The first three of the first Gaussian are never fitted:
+# they would repeat the flux and the position of the stars.
+#
+# sources (M, 3) are x, y and flux of a star and of the neighbours in its
+# stamp, of which the first n_sources count. In the normal equations of one
+# stamp come first the Q numbers of its own, then the 6 K - 3 shapes, then the
+# residual, all in one triangle: eliminating the first Q is a Schur complement
+# that leaves the equations of the shapes, their right side and chi^2.
+
+_TWO_PI = 2 * np.pi
+
+
+@kernel
+def _design(x, y, rows, sources, n_sources, first, row):
+    """
+    Put derivatives of a pixel into row and return the model.
+
+    Those by the shapes are added from index ``first`` on, unless it is
+    negative.
+    """
+    model = 0.0
+    for j in range(n_sources):
+        flux = sources[j, 2]
+        value = 0.0
+        gx = 0.0
+        gy = 0.0
+        for k in range(rows.shape[0]):
+            a, mx, my, p, s, q = rows[k]
+            dx = x - sources[j, 0] - mx
+            dy = y - sources[j, 1] - my
+            u = dx - s * dy
+            pu = p * u
+            qy = q * dy
+            exponent = pu * u + qy * dy
+            if not exponent < LOG_NOTHING:
+                continue
+            g = a * exp(-0.5 * exponent)
+            by_x = pu * g
+            by_y = qy * g - s * by_x
+            value += g
+            gx += by_x
+            gy += by_y
+            if first >= 0:
+                _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy,
+                                       first + 6 * k - 3, k > 0, row)
+        row[3 * j] = flux * gx
+        row[3 * j + 1] = flux * gy
+        row[3 * j + 2] = value
+        model += flux * value
+    return model
+
+
+@kernel
+def _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy, at, moves,
+                           row):
+    fg = flux * g
+    if moves:
+        row[at] += fg
+        row[at + 1] += flux * by_x
+        row[at + 2] += flux * by_y
+    row[at + 3] += fg * (1 - pu * u)
+    row[at + 4] += fg * pu * dy
+    row[at + 5] += fg * (1 - qy * dy)
+
+
+@kernel
+def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
+                fit_sky, with_shapes, block, normal):
+    """
+    Sum the normal equations of a stamp into normal; return their size.
+
+    The size includes the column of the residual. block is scratch (4, D):
+    four pixels at a time save three of four walks through normal.
+    """
+    own = 3 * n_sources + fit_sky
+    size = own + 1
+    first = -1
+    if with_shapes:
+        size += 6 * rows.shape[0] - 3
+        first = own
+    normal[:size, :size] = 0.0
+    filled = 0
+    for j in range(stamp.shape[0]):
+        for i in range(stamp.shape[1]):
+            w = weight[j, i]
+            if w <= 0:
+                continue
+            row = block[filled]
+            row[:size] = 0.0
+            if fit_sky:
+                row[own - 1] = 1.0
+            model = _design(left + i, bottom + j, rows, sources, n_sources,
+                            first, row)
+            row[size - 1] = stamp[j, i] - sky - model
+            root = sqrt(w)
+            for m in range(size):
+                row[m] *= root
+            filled += 1
+            if filled == 4:
+                _add_products(block, size, normal)
+                filled = 0
+    block[filled:, :size] = 0.0
+    _add_products(block, size, normal)
+    return size
+
+
+@kernel
+def _add_products(block, size, normal):
+    """Add the products of the columns of block (4, D), upper triangle."""
+    r0, r1, r2, r3 = block[0], block[1], block[2], block[3]
+    for m in range(size):
+        out = normal[m]
+        c0, c1, c2, c3 = r0[m], r1[m], r2[m], r3[m]
+        for n in range(m, size):
+            out[n] += c0 * r0[n] + c1 * r1[n] + c2 * r2[n] + c3 * r3[n]
+
+
+@kernel
+def _hold_neighbours(sources, anchors, n_sources, hold, size, normal):
+    """Add the prior of the neighbours: anchors with the precisions hold."""
+    for j in range(1, n_sources):
+        for i in range(3):
+            at = 3 * j + i
+            offset = anchors[j, i] - sources[j, i]
+            normal[at, at] += hold[j, i]
+            normal[at, size - 1] += hold[j, i] * offset
+            normal[size - 1, size - 1] += hold[j, i] * offset * offset
+
+
+@kernel
+def _shift_sources(sources, n_sources, sky, fit_sky, step):
+    """Add the step to a stamp's own numbers; return the sky."""
+    for j in range(n_sources):
+        for i in range(2):
+            # A longer step would leave the core, where linear is wrong.
+            sources[j, i] += min(max(step[3 * j + i], -0.5), 0.5)
+        sources[j, 2] += step[3 * j + 2]
+    if fit_sky:
+        return sky + step[3 * n_sources]
+    return sky
+
+
+@kernel
+def field_normal(stamps, weights, corners, basis, rows, jacobians, sources,
+                 anchors, hold, n_sources, sky, fit_sky, used, n_steps,
+                 normal, total, gradient, chi2):
+    """
+    Settle n stars and add the equations of the used ones to total, gradient.
+
+    Each star's own numbers take n_steps Gauss-Newton steps, the PSF given;
+    the last one is taken together with the equations of the shapes, so that
+    chi2 (n,) and gradient are those after it.
+
+    stamps, weights (n, s, s); corners (n, 2), the pixel (x, y) of each
+    stamp's first; basis (n, T); rows (n, K, 6), the PSF of each star;
+    jacobians (n, 6 K - 3, P), the derivatives of its shapes by the P numbers
+    that are polynomials, or (0, 0, 0) if they are the shapes themselves;
+    sources, anchors, hold (n, M, 3); n_sources (n,); sky (n,) with fit_sky;
+    used (n,). normal is scratch (D, D) with D = 3 M + 6 K - 1. total
+    (P T, P T), upper triangle, and gradient (P T,) order unknowns by number,
+    then term.
+    """
+    block = np.empty((4, normal.shape[0]))
+    step = np.empty(normal.shape[0])
+    spread = np.empty(gradient.size)
+    condensed = np.empty((jacobians.shape[2], jacobians.shape[2] + 1))
+    for star in range(stamps.shape[0]):
+        left, bottom = corners[star]
+        own = 3 * n_sources[star] + fit_sky
+        for i in range(n_steps):
+            last = used[star] and i == n_steps - 1
+            size = _accumulate(
+                stamps[star], weights[star], left, bottom, rows[star],
+                sources[star], n_sources[star], sky[star], fit_sky, last,
+                block, normal)
+            _hold_neighbours(sources[star], anchors[star], n_sources[star],
+                             hold[star], size, normal)
+            _eliminate(normal, own, size)
+            _back_substitute(normal, own, size, step)
+            sky[star] = _shift_sources(sources[star], n_sources[star],
+                                       sky[star], fit_sky, step)
+        chi2[star] = normal[size - 1, size - 1]
+        if not used[star]:
+            continue
+        if jacobians.size:
+            _condense(normal, own, size, jacobians[star], condensed)
+            _spread(condensed, 0, condensed.shape[1], basis[star], spread,
+                    total, gradient)
+        else:
+            _spread(normal, own, size, basis[star], spread, total, gradient)
+
+
+@kernel
+def _condense(normal, own, size, jacobian, out):
+    """Put J^T A J and J^T b into out (P, P + 1), upper triangle."""
+    n, p = jacobian.shape
+    out[:] = 0.0
+    line = np.empty(p + 1)
+    for i in range(n):
+        line[:] = 0.0
+        for j in range(n):
+            a = normal[own + min(i, j), own + max(i, j)]
+            for m in range(p):
+                line[m] += a * jacobian[j, m]
+        line[p] = normal[own + i, size - 1]
+        for k in range(p):
+            share = jacobian[i, k]
+            if share != 0:
+                for m in range(k, p + 1):
+                    out[k, m] += share * line[m]
+
+
+@kernel
+def _spread(normal, own, size, basis, spread, total, gradient):
+    """Add A (x) B B^T to total, A being what is left of normal."""
+    n_terms = basis.size
+    for p in range(size - own - 1):
+        for q in range(p, size - own - 1):
+            for t in range(n_terms):
+                spread[q * n_terms + t] = normal[own + p, own + q] * basis[t]
+        right = normal[own + p, size - 1]
+        for t in range(n_terms):
+            b = basis[t]
+            if b != 0:
+                at = p * n_terms + t
+                gradient[at] += b * right
+                for j in range(p * n_terms, spread.size):
+                    total[at, j] += b * spread[j]
+
+
+@kernel
+def field_model(corners, rows, sources, n_sources, sky, out):
+    """Put model stamps of n stars, neighbours and sky included, into out."""
+    for star in range(out.shape[0]):
+        left, bottom = corners[star]
+        out[star] = sky[star]
+        for j in range(n_sources[star]):
+            x, y, flux = sources[star, j]
+            render(rows[star], x - left, y - bottom, flux, False, out[star])

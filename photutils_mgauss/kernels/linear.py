@@ -1,0 +1,272 @@
+"""Small systems of linear equations."""
+from math import sqrt
+
+import numpy as np
+
+from photutils_mgauss.kernels.jit import kernel
+
+
+@kernel
+def _factor(matrix, n):
+    """
+    Overwrite the lower triangle of matrix (n, n) by its Cholesky factor.
+
+    A pivot lost to rounding is replaced by a huge one, which sets the unknown
+    to zero instead of ending the fit.
+    """
+    for j in range(n):
+        diagonal = matrix[j, j]
+        pivot = diagonal
+        for k in range(j):
+            pivot -= matrix[j, k] * matrix[j, k]
+        if not pivot > 1e-14 * diagonal:
+            pivot = 1e30 * max(diagonal, 1e-30)
+        root = sqrt(pivot)
+        matrix[j, j] = root
+        for i in range(j + 1, n):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = total / root
+
+
+@kernel
+def _solve_factored(factor, n, x):
+    """Overwrite x (n,) by the solution of factor factor^T y = x."""
+    for i in range(n):
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= factor[k, i] * x[k]
+        x[i] /= factor[i, i]
+
+
+@kernel
+def _solve_subset(gram, rhs, active, x, work):
+    """Solve gram x = rhs over the active unknowns; the others are zero."""
+    n = rhs.size
+    count = 0
+    for i in range(n):
+        if not active[i]:
+            continue
+        column = 0
+        for j in range(i + 1):
+            if active[j]:
+                work[count, column] = gram[i, j]
+                column += 1
+        work[count, n] = rhs[i]
+        count += 1
+    _factor(work, count)
+    solution = work[:count, n].copy()
+    _solve_factored(work, count, solution)
+    count = 0
+    for i in range(n):
+        x[i] = 0.0
+        if active[i]:
+            x[i] = solution[count]
+            count += 1
+
+
+@kernel
+def _steepest(gram, rhs, active, x):
+    """Return the inactive unknown that would lower the cost most, or -1."""
+    best, gain = -1, 0.0
+    for i in range(rhs.size):
+        if active[i]:
+            continue
+        slope = rhs[i]
+        for j in range(rhs.size):
+            slope -= gram[i, j] * x[j]
+        if slope > 1e-12 * abs(rhs[i]) + gain:
+            best, gain = i, slope
+    return best
+
+
+@kernel
+def _solve_fluxes(gram, rhs, signed, x, active, work):
+    """
+    Solve min |G x - z| with x >= 0, unless signed.
+
+    gram is G^T G, rhs G^T z. Lawson and Hanson's active set, started from
+    all unknowns free. work is (n, n + 1).
+    """
+    n = rhs.size
+    active[:] = True
+    _solve_subset(gram, rhs, active, x, work)
+    if signed:
+        return
+    for _ in range(3 * n):
+        worst = np.argmin(x)
+        if x[worst] < 0:
+            active[worst] = False
+            _solve_subset(gram, rhs, active, x, work)
+            continue
+        best = _steepest(gram, rhs, active, x)
+        if best < 0:
+            return
+        active[best] = True
+        _solve_subset(gram, rhs, active, x, work)
+        if x[best] <= 0:
+            active[best] = False
+            _solve_subset(gram, rhs, active, x, work)
+            return
+    for i in range(n):
+        x[i] = max(x[i], 0.0)
+
+
+@kernel
+def _factorize(matrix, frozen, damping, size, steepest, scale, factor):
+    """
+    Put the Cholesky factor of the damped, scaled matrix into factor.
+
+    scale (size,) takes the square roots of the diagonal; rows of frozen
+    parameters become those of the unit matrix. Damping is in units of
+    steepest, the largest diagonal so far: as a star gets faint its position
+    must not become free to run away. Returns whether the matrix is positive
+    definite to working precision.
+    """
+    for a in range(size):
+        d = matrix[a, a]
+        steepest[a] = max(steepest[a], d)
+        if frozen[a] or not d > 0:
+            frozen[a] = True
+            scale[a] = 1.0
+        else:
+            scale[a] = sqrt(d)
+    for a in range(size):
+        for b in range(a + 1):
+            if frozen[a] or frozen[b]:
+                value = 1.0 if a == b else 0.0
+            else:
+                value = matrix[a, b] / (scale[a] * scale[b])
+                if a == b and damping > 0:
+                    value += damping * steepest[a] / matrix[a, a]
+            for c in range(b):
+                value -= factor[a, c] * factor[b, c]
+            if a == b:
+                if not value > 1e-14:
+                    return False
+                factor[a, a] = sqrt(value)
+            else:
+                factor[a, b] = value / factor[b, b]
+    return True
+
+
+@kernel
+def _solve(factor, scale, size, vector):
+    """Solve for the scaled vector in place, given the Cholesky factor."""
+    for a in range(size):
+        value = vector[a] / scale[a]
+        for b in range(a):
+            value -= factor[a, b] * vector[b]
+        vector[a] = value / factor[a, a]
+    for a in range(size - 1, -1, -1):
+        value = vector[a]
+        for b in range(a + 1, size):
+            value -= factor[b, a] * vector[b]
+        vector[a] = value / factor[a, a]
+    for a in range(size):
+        vector[a] /= scale[a]
+
+
+@kernel
+def _eliminate(normal, n, size):
+    """Eliminate the first n unknowns from the upper triangle, in place."""
+    for k in range(n):
+        pivot = normal[k, k]
+        if not pivot > 0:
+            continue
+        for i in range(k + 1, size):
+            factor = normal[k, i] / pivot
+            if factor != 0:
+                for j in range(i, size):
+                    normal[i, j] -= factor * normal[k, j]
+
+
+@kernel
+def _back_substitute(normal, n, size, step):
+    """Solve for the first n unknowns after their elimination."""
+    for k in range(n - 1, -1, -1):
+        right = normal[k, size - 1]
+        for j in range(k + 1, n):
+            right -= normal[k, j] * step[j]
+        step[k] = right / normal[k, k] if normal[k, k] > 0 else 0.0
+
+
+@kernel
+def solve(augmented, step):
+    """
+    Solve a symmetric positive definite system for step (n,).
+
+    augmented (n, n + 1) holds the matrix and the right side; only the upper
+    triangle is read, and destroyed.
+    """
+    n = step.size
+    for k in range(n):
+        pivot = augmented[k, k]
+        if not pivot > 0:
+            continue
+        upper = augmented[k]
+        for i in range(k + 1, n):
+            factor = upper[i] / pivot
+            row = augmented[i]
+            for j in range(i, n + 1):
+                row[j] -= factor * upper[j]
+    _back_substitute(augmented, n, n + 1, step)
+
+
+@kernel
+def _invert_3x3(a, out):
+    """Invert a symmetric matrix; zeros if it is not positive definite."""
+    c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[1, 2]
+    c01 = a[0, 2] * a[1, 2] - a[0, 1] * a[2, 2]
+    c02 = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
+    det = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
+    if not det > 1e-12 * a[0, 0] * a[1, 1] * a[2, 2]:
+        out[:] = 0
+        return
+    out[0, 0] = c00 / det
+    out[0, 1] = out[1, 0] = c01 / det
+    out[0, 2] = out[2, 0] = c02 / det
+    out[1, 1] = (a[0, 0] * a[2, 2] - a[0, 2] * a[0, 2]) / det
+    out[1, 2] = out[2, 1] = (a[0, 1] * a[0, 2] - a[0, 0] * a[1, 2]) / det
+    out[2, 2] = (a[0, 0] * a[1, 1] - a[0, 1] * a[0, 1]) / det
+
+
+@kernel
+def _cholesky(a, n):
+    """Factor a[:n, :n] in place; False where it is not positive definite."""
+    for i in range(n):
+        for j in range(i + 1):
+            total = a[i, j]
+            for k in range(j):
+                total -= a[i, k] * a[j, k]
+            if i == j:
+                if not total > 1e-12:
+                    return False
+                a[i, i] = sqrt(total)
+            else:
+                a[i, j] = total / a[j, j]
+    return True
+
+
+@kernel
+def _factor_inverse_columns(a, n, first, count, out):
+    """
+    Put columns first, ... of inverse(L L^T) into out[:n, :count].
+
+    a holds L below and on its diagonal.
+    """
+    for c in range(count):
+        for i in range(n):
+            total = 1.0 if i == first + c else 0.0
+            for k in range(i):
+                total -= a[i, k] * out[k, c]
+            out[i, c] = total / a[i, i]
+        for i in range(n - 1, -1, -1):
+            total = out[i, c]
+            for k in range(i + 1, n):
+                total -= a[k, i] * out[k, c]
+            out[i, c] = total / a[i, i]

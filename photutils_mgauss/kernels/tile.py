@@ -1,0 +1,181 @@
+"""The PSF of a star and its derivatives on a tile of pixels."""
+from math import exp
+
+import numpy as np
+
+from photutils_mgauss.kernels.gaussian import (
+    NOTHING,
+    point_gradient,
+    point_value,
+)
+from photutils_mgauss.kernels.grid import blend_weights
+from photutils_mgauss.kernels.jit import kernel
+
+# The PSF of a star and its derivatives by position are summed in a tile, one
+# flat array: for each pixel column _LANES values of the PSF, as many of its
+# derivative by x_0, and as many by y_0. Neighbouring rows are neighbours in
+# memory and fixed offsets lie between the parts, so that the compiler works on
+# several rows at once; their number is a constant, for a remainder of a few
+# rows one by one would take longer than all the others.
+LANES = 16
+
+# The smallest share of a Gaussian in a blend, so that the slope of the share
+# can be divided by it; lost in rounding where it stands for zero.
+_LEAST_SHARE = 1e-30
+
+
+@kernel
+def strides(nodes, out):
+    """
+    Put the constant factors of walks over Gaussians into out (M, K, 4).
+
+    The precision along y at fixed x; how the quotient of columns grows from
+    row to row; how the quotients of rows, and of columns, fall.
+    """
+    for m in range(nodes.shape[0]):
+        for k in range(nodes.shape[1]):
+            _, _, _, p, s, q = nodes[m, k]
+            t = q + s * s * p
+            out[m, k, 0] = t
+            out[m, k, 1] = exp(p * s)
+            out[m, k, 2] = exp(-t)
+            out[m, k, 3] = exp(-p)
+
+
+@kernel
+def _walk_starts(a, dx, dy, p, s, q, pace, by_x, by_y, height, walk):
+    """
+    Put what a walk along the columns starts from into walk (4, _LANES) flat.
+
+    For each row the Gaussian in the first column, its quotient with the next
+    one, and the factors of the Gaussian in its derivative by x and, short of
+    s times the former, by y. Rows from height on stay as they are. Returns
+    whether anything is there. The values of the first column are a Gaussian
+    in y, walked outward from its peak. pace is as of `paces`.
+    """
+    t, grow, drop, _ = pace
+    u = dx
+    slope = q * dy - p * s * u
+    top = min(max(int(np.rint(-slope / t)), 0), height - 1)
+    u -= s * top
+    slope += t * top
+    first = a * exp(-0.5 * (p * u * u + q * (dy + top) ** 2))
+    if abs(first) < NOTHING:
+        return False
+    g = first
+    r = exp(-slope - 0.5 * t)
+    for j in range(top, height):
+        walk[j] = g
+        g *= r
+        r *= drop
+    g = first
+    r = exp(slope - 0.5 * t)
+    for j in range(top - 1, -1, -1):
+        g *= r
+        r *= drop
+        walk[j] = g
+    r = exp(-p * (dx + 0.5))
+    for j in range(height):
+        walk[LANES + j] = r
+        r *= grow
+    by_y += s * by_x
+    for j in range(height):
+        walk[2 * LANES + j] = p * (dx - s * j) + by_x
+        walk[3 * LANES + j] = q * (dy + j) + by_y
+    return True
+
+
+@kernel
+def _add_walk(p, s, fall, width, walk, tile):
+    """Add a Gaussian to a tile, two multiplications a pixel."""
+    for i in range(width):
+        column = 3 * LANES * i
+        pi = p * i
+        for j in range(LANES):
+            g = walk[j]
+            r = walk[LANES + j]
+            h = (walk[2 * LANES + j] + pi) * g
+            tile[column + j] += g
+            tile[column + LANES + j] += h
+            tile[column + 2 * LANES + j] += walk[3 * LANES + j] * g - s * h
+            walk[j] = g * r
+            walk[LANES + j] = r * fall
+
+
+@kernel
+def _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height, width,
+                tile):
+    """Add a Gaussian to a tile, each pixel for itself."""
+    for i in range(width):
+        for j in range(height):
+            u, v = dx + i, dy + j
+            g = a * point_value(u, v, p, s, q, integrated)
+            gx, gy = point_gradient(u, v, p, s, q, integrated)
+            k = 3 * LANES * i + j
+            tile[k] += g
+            tile[k + LANES] += by_x * g - a * gx
+            tile[k + 2 * LANES] += by_y * g - a * gy
+
+
+@kernel
+def add_gaussian(a, dx, dy, p, s, q, pace, by_x, by_y, integrated, height,
+                 width, walk, tile):
+    """
+    Add a Gaussian, its first pixel at (dx, dy) from the peak, to a tile.
+
+    a includes its share in the blend, whose relative slopes are by_x and
+    by_y.
+    """
+    left = min(dx - s * dy, dx - s * (dy + height - 1))
+    # A walk that begins too far out begins at zero.
+    steep = (p > 50 or q > 50 or p * abs(s) * height > 200
+             or (left < 0 and p * left * left > 600))
+    if integrated or steep:
+        _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height,
+                    width, tile)
+    elif _walk_starts(a, dx - s * dy, dy, p, s, q, pace, by_x, by_y, height,
+                      walk):
+        _add_walk(p, s, pace[3], width, walk, tile)
+
+
+@kernel
+def _fill_tile(x_0, y_0, row, column, height, width, psf, tiling):
+    """Put the PSF and its derivatives in up to _LANES rows into the tile."""
+    nodes, strides, _, _, integrated = psf
+    walk, tile, index, weights = tiling
+    walk[:] = 0.0
+    tile[:3 * LANES * width] = 0.0
+    for corner in range(4):
+        w, wx, wy = weights[0, corner], weights[1, corner], weights[2, corner]
+        if w == 0 and wx == 0 and wy == 0:
+            continue
+        w = max(w, _LEAST_SHARE)
+        for k in range(nodes.shape[1]):
+            a, mx, my, p, s, q = nodes[index[corner], k]
+            if a != 0:
+                add_gaussian(w * a, column - x_0 - mx, row - y_0 - my, p, s,
+                             q, strides[index[corner], k], wx / w, wy / w,
+                             integrated, height, width, walk, tile)
+
+
+@kernel
+def fill_jet(x_0, y_0, box, psf, tiling, jet):
+    """
+    Put the unit-flux PSF in a box and its derivatives by x_0 and y_0.
+
+    They go into jet (3, width * height), column after column. psf is (nodes,
+    paces, x_grid, y_grid, integrated), tiling is scratch (walk, tile, index,
+    weights). The change of the blend with position is included.
+    """
+    _, tile, index, weights = tiling
+    blend_weights(x_0, y_0, psf[2], psf[3], index, weights)
+    row, column, height, width = box
+    for bottom in range(0, height, LANES):
+        rows = min(LANES, height - bottom)
+        _fill_tile(x_0, y_0, row + bottom, column, rows, width, psf, tiling)
+        for part in range(3):
+            for i in range(width):
+                k = (3 * i + part) * LANES
+                to = i * height + bottom
+                for j in range(rows):
+                    jet[part, to + j] = tile[k + j]
