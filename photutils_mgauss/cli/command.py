@@ -6,9 +6,16 @@ import warnings
 from tqdm import tqdm
 
 from photutils_mgauss import __version__
-from photutils_mgauss.cli import demo_command, motions, photometry, psf, report
+from photutils_mgauss.cli import (
+    compile_command,
+    demo_command,
+    motions,
+    photometry,
+    psf,
+    report,
+)
 
-_COMMANDS = (psf, photometry, motions, report, demo_command)
+_COMMANDS = (psf, photometry, motions, report, demo_command, compile_command)
 
 _EPILOG = """\
 From two images to proper motions and a page that shows them:

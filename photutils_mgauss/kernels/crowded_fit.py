@@ -5,7 +5,7 @@ import numpy as np
 
 from photutils_mgauss.kernels.gaussian import fast_exp
 from photutils_mgauss.kernels.image import ERRORS, add_sampled, add_star
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import (
     _cholesky,
     _factor_inverse_columns,
@@ -54,7 +54,7 @@ def star_stamps(chosen, x, y, left, bottom, width, offset, rows, strides,
                     jets[2, to + k] = tile[at + 2 * LANES]
 
 
-@kernel
+@inner
 def _walk_rows(start, end, way, fall, first, g, r, image):
     """Add g (n,) to rows start, start + way, ... end of image, r its fall."""
     for j in range(start, end + way, way):
@@ -65,7 +65,7 @@ def _walk_rows(start, end, way, fall, first, g, r, image):
             r[i] *= fall
 
 
-@kernel
+@inner
 def _add_lanes(peak, cx, cy, p, s, q, reach, lanes, image):
     """
     Add a Gaussian, sampled at pixel centres, to a box of the image.
@@ -338,7 +338,7 @@ def pair_blocks(indptr, neighbour, twin, flux, left, bottom, width, offset,
                     blocks[twin[pair], n, m] = block[m, n]
 
 
-@kernel
+@inner
 def _apply_mesh(v, mesh, tie, columns, out):
     """Multiply by the matrix of a background, as of `solve_joint`."""
     for m in range(v.size):
@@ -355,7 +355,7 @@ def _apply_mesh(v, mesh, tie, columns, out):
         out[m] = mesh[m] * v[m] - tie * near
 
 
-@kernel
+@inner
 def _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node, share,
                  reach, mesh, tie, columns, out, mesh_out):
     """
@@ -396,7 +396,7 @@ def _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node, share,
     return product
 
 
-@kernel
+@inner
 def _precondition(inverse, mesh, r, mesh_r, z, mesh_z):
     """Put r times the inverse blocks into z; return the product of both."""
     product = 0.0
@@ -414,14 +414,14 @@ def _precondition(inverse, mesh, r, mesh_r, z, mesh_z):
     return product
 
 
-@kernel
+@inner
 def _add_scaled(x, scale, y):
     """Add scale * y to x, both flat."""
     for i in range(x.size):
         x[i] += scale * y[i]
 
 
-@kernel
+@inner
 def _extend(x, scale, y):
     """Put y + scale * x into x, both flat."""
     for i in range(x.size):

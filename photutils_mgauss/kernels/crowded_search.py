@@ -3,7 +3,7 @@ from math import ceil, sqrt
 
 import numpy as np
 
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import _cholesky
 
 
@@ -51,7 +51,7 @@ def score(residual, weight, template, x_low, x_high, y_low, y_high, hint,
                 significance[y, x] = flux[y, x] * sqrt(info)
 
 
-@kernel
+@inner
 def _template_products(x, y, template, weight, residual, light, out):
     """
     Put the sums of t w r, t^2 w and (t w light)^2 around a pixel into out.
@@ -81,7 +81,7 @@ def _template_products(x, y, template, weight, residual, light, out):
     return 3 * seen >= power
 
 
-@kernel
+@inner
 def _template_overlap(x, y, template, weight, left, bottom, width, jets, flux,
                       out):
     """Put the sums of t w times a star's derivatives into out (3,)."""

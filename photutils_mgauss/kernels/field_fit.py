@@ -4,7 +4,7 @@ from math import exp, sqrt
 import numpy as np
 
 from photutils_mgauss.kernels.gaussian import LOG_NOTHING
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import _back_substitute, _eliminate
 from photutils_mgauss.kernels.rows import render
 
@@ -24,7 +24,7 @@ from photutils_mgauss.kernels.rows import render
 _TWO_PI = 2 * np.pi
 
 
-@kernel
+@inner
 def _design(x, y, rows, sources, n_sources, first, row):
     """
     Put derivatives of a pixel into row and return the model.
@@ -64,7 +64,7 @@ def _design(x, y, rows, sources, n_sources, first, row):
     return model
 
 
-@kernel
+@inner
 def _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy, at, moves,
                            row):
     fg = flux * g
@@ -77,7 +77,7 @@ def _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy, at, moves,
     row[at + 5] += fg * (1 - qy * dy)
 
 
-@kernel
+@inner
 def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
                 fit_sky, with_shapes, block, normal):
     """
@@ -118,7 +118,7 @@ def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
     return size
 
 
-@kernel
+@inner
 def _add_products(block, size, normal):
     """Add the products of the columns of block (4, D), upper triangle."""
     r0, r1, r2, r3 = block[0], block[1], block[2], block[3]
@@ -129,7 +129,7 @@ def _add_products(block, size, normal):
             out[n] += c0 * r0[n] + c1 * r1[n] + c2 * r2[n] + c3 * r3[n]
 
 
-@kernel
+@inner
 def _hold_neighbours(sources, anchors, n_sources, hold, size, normal):
     """Add the prior of the neighbours: anchors with the precisions hold."""
     for j in range(1, n_sources):
@@ -141,7 +141,7 @@ def _hold_neighbours(sources, anchors, n_sources, hold, size, normal):
             normal[size - 1, size - 1] += hold[j, i] * offset * offset
 
 
-@kernel
+@inner
 def _shift_sources(sources, n_sources, sky, fit_sky, step):
     """Add the step to a stamp's own numbers; return the sky."""
     for j in range(n_sources):
@@ -204,7 +204,7 @@ def field_normal(stamps, weights, corners, basis, rows, jacobians, sources,
             _spread(normal, own, size, basis[star], spread, total, gradient)
 
 
-@kernel
+@inner
 def _condense(normal, own, size, jacobian, out):
     """Put J^T A J and J^T b into out (P, P + 1), upper triangle."""
     n, p = jacobian.shape
@@ -224,7 +224,7 @@ def _condense(normal, own, size, jacobian, out):
                     out[k, m] += share * line[m]
 
 
-@kernel
+@inner
 def _spread(normal, own, size, basis, spread, total, gradient):
     """Add A (x) B B^T to total, A being what is left of normal."""
     n_terms = basis.size

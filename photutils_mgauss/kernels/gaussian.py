@@ -3,10 +3,13 @@ from decimal import Decimal
 from math import ceil, erf, exp, factorial, sqrt
 
 import numpy as np
-from numba import types
-from numba.extending import intrinsic
 
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import (
+    bits_of_float,
+    float_of_bits,
+    inner,
+    kernel,
+)
 
 # Nodes and weights of 8-point Gauss-Legendre quadrature on (-1/2, 1/2);
 # numpy.polynomial.legendre.leggauss(8), halved.
@@ -36,22 +39,7 @@ _LOG2_LOW = float(Decimal(2).ln() - Decimal(_LOG2_HIGH))
 _TERMS = tuple(1 / factorial(n) for n in range(13, -1, -1))
 
 
-@intrinsic
-def _float_of_bits(context, bits):
-    def generate(context, builder, signature, args):
-        return builder.bitcast(args[0],
-                               context.get_value_type(types.float64))
-    return types.float64(types.int64), generate
-
-
-@intrinsic
-def _bits_of_float(context, number):
-    def generate(context, builder, signature, args):
-        return builder.bitcast(args[0], context.get_value_type(types.int64))
-    return types.int64(types.float64), generate
-
-
-@kernel
+@inner
 def fast_exp(x):
     """Return exp(x) for x <= 0, and 0 where that is below 1e-299."""
     shifted = x * _LOG2_E + _ROUND
@@ -60,7 +48,7 @@ def fast_exp(x):
     series = _TERMS[0]
     for term in _TERMS[1:]:
         series = series * r + term
-    power = _float_of_bits((_bits_of_float(shifted) + 1023) << 52)
+    power = float_of_bits((bits_of_float(shifted) + 1023) << 52)
     return 0.0 if x < -688 else series * power
 
 
@@ -73,21 +61,21 @@ def exponentials(x, out):
 
 # One Gaussian at one point. (dx, dy) is the offset from the centre.
 
-@kernel
+@inner
 def _gaussian(dx, dy, p, s, q):
     """Return a Gaussian of unit peak."""
     u = dx - s * dy
     return exp(-0.5 * (p * u * u + q * dy * dy))
 
 
-@kernel
+@inner
 def _slice_integral(lower, upper, p):
     """Integrate exp(-p t^2 / 2) from lower to upper."""
     root = sqrt(0.5 * p)
     return HALF_PI_ROOT / sqrt(p) * (erf(root * upper) - erf(root * lower))
 
 
-@kernel
+@inner
 def count_panels(p, s, q):
     """Return how many quadrature panels a pixel needs along y."""
     # At fixed x the Gaussian has the precision q + s^2 p along y. Eight
@@ -95,7 +83,7 @@ def count_panels(p, s, q):
     return max(1, ceil(0.5 * sqrt(q + s * s * p)))
 
 
-@kernel
+@inner
 def _pixel_integral(dx, dy, p, s, q):
     """Integrate a Gaussian of unit peak over the unit pixel at (dx, dy)."""
     n = count_panels(p, s, q)
@@ -110,7 +98,7 @@ def _pixel_integral(dx, dy, p, s, q):
     return total / n
 
 
-@kernel
+@inner
 def point_value(dx, dy, p, s, q, integrated):
     """Return a Gaussian of unit peak, or its integral over a pixel."""
     if integrated:
@@ -118,7 +106,7 @@ def point_value(dx, dy, p, s, q, integrated):
     return _gaussian(dx, dy, p, s, q)
 
 
-@kernel
+@inner
 def _edge(dx, dy, p, s, q):
     """
     Integrate g and dg/dx over y in dy +- 1/2 on the line x = dx.
@@ -138,7 +126,7 @@ def _edge(dx, dy, p, s, q):
     return value, slope
 
 
-@kernel
+@inner
 def point_gradient(dx, dy, p, s, q, integrated):
     """Return dg/dx and dg/dy, of the value or of the pixel integral."""
     if not integrated:
@@ -155,14 +143,14 @@ def point_gradient(dx, dy, p, s, q, integrated):
     return right - left, top - bottom
 
 
-@kernel
+@inner
 def _transposed(p, s, q):
     """Return the factors of the same Gaussian with x and y exchanged."""
     r = q + s * s * p
     return r, s * p / r, p * q / r
 
 
-@kernel
+@inner
 def point_hessian(dx, dy, p, s, q, integrated):
     """Return d2g/dx2, d2g/dxdy, d2g/dy2, of value or pixel integral."""
     if not integrated:
@@ -185,7 +173,7 @@ def point_hessian(dx, dy, p, s, q, integrated):
 
 # Mixtures at arbitrary points. rows is (K, 6); x and y are (n,).
 
-@kernel
+@inner
 def add_values(x, y, x_0, y_0, row, scale, integrated, out):
     """Add a Gaussian, centred on (x_0, y_0) plus its mean, to out (n,)."""
     a, mx, my, p, s, q = row
@@ -202,7 +190,7 @@ def add_values(x, y, x_0, y_0, row, scale, integrated, out):
         out[i] += peak * fast_exp(-0.5 * (p * u * u + q * dy * dy))
 
 
-@kernel
+@inner
 def add_jet(x, y, x_0, y_0, row, scales, integrated, out):
     """
     Add value, slope by x_0 and slope by y_0 of a Gaussian to out (3, n).

@@ -10,13 +10,13 @@ from photutils_mgauss.kernels.gaussian import (
     point_hessian,
     point_value,
 )
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.rows import render
 
 # A grid of mixtures, four neighbours blended. nodes is (M, K, 6), ordered by
 # y, then x; x_grid (nx,) and y_grid (ny,) ascend, nx * ny = M.
 
-@kernel
+@inner
 def _cell(position, grid):
     """
     Return the cell, its blend fraction and the fraction's slope.
@@ -107,7 +107,7 @@ def differentiate_grid(x, y, x_0, y_0, nodes, x_grid, y_grid, integrated,
                         out)
 
 
-@kernel
+@inner
 def _add_stamp(rows, x_0, y_0, flux, integrated, px, py, out):
     """Add a star to a stamp (ny, nx) whose pixels are at px and py (n,)."""
     if integrated:
@@ -120,7 +120,7 @@ def _add_stamp(rows, x_0, y_0, flux, integrated, px, py, out):
                        out.reshape(px.size))
 
 
-@kernel
+@inner
 def _pixel_positions(ny, nx):
     px = np.empty(ny * nx)
     py = np.empty(ny * nx)
@@ -155,7 +155,7 @@ def render_grid(x, y, flux, left, bottom, nodes, x_grid, y_grid, integrated,
 # second moments of their sum. sums is (M, K, 6) and holds of each Gaussian
 # the integrals of 1, x, y, x^2, xy, y^2, which blend linearly.
 
-@kernel
+@inner
 def match_rows(x_0, y_0, sums, x_grid, y_grid, rows, slopes):
     """
     Put the K blended Gaussians at (x_0, y_0) into rows (K, 6).
@@ -196,7 +196,7 @@ def match_rows(x_0, y_0, sums, x_grid, y_grid, rows, slopes):
                                   - 2 * my * dy)
 
 
-@kernel
+@inner
 def _blend_sums(index, weights, sums, k, out):
     for j in range(6):
         out[j] = 0.0
@@ -204,7 +204,7 @@ def _blend_sums(index, weights, sums, k, out):
             out[j] += weights[corner] * sums[index[corner], k, j]
 
 
-@kernel
+@inner
 def _central(sums):
     """Return flux, mean and covariance of what has these integrals."""
     f = sums[0]

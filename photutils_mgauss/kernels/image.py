@@ -4,7 +4,7 @@ from math import ceil, exp, factorial, floor, log, sqrt
 import numpy as np
 
 from photutils_mgauss.kernels.grid import blend_weights, match_rows
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.rows import add_integrated_row
 
 # Many stars on one image. A Gaussian is drawn where it exceeds ``faintest``,
@@ -40,7 +40,7 @@ _POINTS, _SHARES, ERRORS = _quadrature_tables()
 _QUADRATURE_ERROR = 1e-5
 
 
-@kernel
+@inner
 def _quadrature_order(precision, tolerance):
     """Return the number of points that suffice, or 0 if none does."""
     power = 1.0
@@ -51,7 +51,7 @@ def _quadrature_order(precision, tolerance):
     return 0
 
 
-@kernel
+@inner
 def _walk(peak, right, left, fall, start, first, last, row):
     """
     Add a row Gaussian to row[first:last + 1], from its value at start.
@@ -71,7 +71,7 @@ def _walk(peak, right, left, fall, start, first, last, row):
         row[i] += g
 
 
-@kernel
+@inner
 def add_sampled(peak, cx, cy, p, s, q, reach, out):
     """Add a Gaussian, sampled at pixel centres, to out (ny, nx)."""
     half = sqrt(reach / q)
@@ -92,7 +92,7 @@ def add_sampled(peak, cx, cy, p, s, q, reach, out):
               last, out[j])
 
 
-@kernel
+@inner
 def _prepare_points(n, p, scratch):
     """
     Put what the points along x share into scratch (3, n).
@@ -108,7 +108,7 @@ def _prepare_points(n, p, scratch):
         scratch[2, a] = exp(-p * (0.5 - t))
 
 
-@kernel
+@inner
 def _add_integrated(peak, cx, cy, p, s, q, reach, tolerance, scratch, out):
     """Add a Gaussian, integrated over each pixel, to out (ny, nx)."""
     n_x = _quadrature_order(p, tolerance)
@@ -140,7 +140,7 @@ def _add_integrated(peak, cx, cy, p, s, q, reach, tolerance, scratch, out):
                       start, first, last, out[j])
 
 
-@kernel
+@inner
 def _add_thin(peak, cx, cy, p, s, q, reach, out):
     """Add a Gaussian much thinner than a pixel, integrated over each."""
     half_y = sqrt(reach / q) + 0.5
@@ -155,7 +155,7 @@ def _add_thin(peak, cx, cy, p, s, q, reach, out):
                            out[j, first:last + 1])
 
 
-@kernel
+@inner
 def add_star(rows, flux, cx, cy, integrated, faintest, scratch, out):
     """Add a star at (cx, cy) of out; rows is (K, 6), scratch (3, 9)."""
     highest = 0.0
@@ -237,7 +237,7 @@ def bleed(columns, full_well):
                     carried = 0.0
 
 
-@kernel
+@inner
 def _spline_taps(t, taps):
     """Put the cubic B-spline at 1 + t, t, 1 - t and 2 - t into taps (4,)."""
     taps[0] = (1 - t) ** 3 / 6
@@ -246,7 +246,7 @@ def _spline_taps(t, taps):
     taps[2] = 1 - taps[0] - taps[1] - taps[3]
 
 
-@kernel
+@inner
 def _add_epsf(image, share, x, y, reach, oversampling, wx, wy, out):
     """Add a star at (x, y) of out, from the spline of an ePSF image."""
     low_y = max(0, ceil(y - reach))

@@ -3,10 +3,10 @@ from math import sqrt
 
 import numpy as np
 
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel
 
 
-@kernel
+@inner
 def _factor(matrix, n):
     """
     Overwrite the lower triangle of matrix (n, n) by its Cholesky factor.
@@ -30,7 +30,7 @@ def _factor(matrix, n):
             matrix[i, j] = total / root
 
 
-@kernel
+@inner
 def _solve_factored(factor, n, x):
     """Overwrite x (n,) by the solution of factor factor^T y = x."""
     for i in range(n):
@@ -43,7 +43,7 @@ def _solve_factored(factor, n, x):
         x[i] /= factor[i, i]
 
 
-@kernel
+@inner
 def _solve_subset(gram, rhs, active, x, work):
     """Solve gram x = rhs over the active unknowns; the others are zero."""
     n = rhs.size
@@ -69,7 +69,7 @@ def _solve_subset(gram, rhs, active, x, work):
             count += 1
 
 
-@kernel
+@inner
 def _steepest(gram, rhs, active, x):
     """Return the inactive unknown that would lower the cost most, or -1."""
     best, gain = -1, 0.0
@@ -84,7 +84,7 @@ def _steepest(gram, rhs, active, x):
     return best
 
 
-@kernel
+@inner
 def _solve_fluxes(gram, rhs, signed, x, active, work):
     """
     Solve min |G x - z| with x >= 0, unless signed.
@@ -116,7 +116,7 @@ def _solve_fluxes(gram, rhs, signed, x, active, work):
         x[i] = max(x[i], 0.0)
 
 
-@kernel
+@inner
 def _factorize(matrix, frozen, damping, size, steepest, scale, factor):
     """
     Put the Cholesky factor of the damped, scaled matrix into factor.
@@ -154,7 +154,7 @@ def _factorize(matrix, frozen, damping, size, steepest, scale, factor):
     return True
 
 
-@kernel
+@inner
 def _solve(factor, scale, size, vector):
     """Solve for the scaled vector in place, given the Cholesky factor."""
     for a in range(size):
@@ -171,7 +171,7 @@ def _solve(factor, scale, size, vector):
         vector[a] /= scale[a]
 
 
-@kernel
+@inner
 def _eliminate(normal, n, size):
     """Eliminate the first n unknowns from the upper triangle, in place."""
     for k in range(n):
@@ -185,7 +185,7 @@ def _eliminate(normal, n, size):
                     normal[i, j] -= factor * normal[k, j]
 
 
-@kernel
+@inner
 def _back_substitute(normal, n, size, step):
     """Solve for the first n unknowns after their elimination."""
     for k in range(n - 1, -1, -1):
@@ -217,7 +217,7 @@ def solve(augmented, step):
     _back_substitute(augmented, n, n + 1, step)
 
 
-@kernel
+@inner
 def _invert_3x3(a, out):
     """Invert a symmetric matrix; zeros if it is not positive definite."""
     c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[1, 2]
@@ -235,7 +235,7 @@ def _invert_3x3(a, out):
     out[2, 2] = (a[0, 0] * a[1, 1] - a[0, 1] * a[0, 1]) / det
 
 
-@kernel
+@inner
 def _cholesky(a, n):
     """Factor a[:n, :n] in place; False where it is not positive definite."""
     for i in range(n):
@@ -252,7 +252,7 @@ def _cholesky(a, n):
     return True
 
 
-@kernel
+@inner
 def _factor_inverse_columns(a, n, first, count, out):
     """
     Put columns first, ... of inverse(L L^T) into out[:n, :count].

@@ -4,7 +4,7 @@ from math import exp, sqrt
 import numpy as np
 
 from photutils_mgauss.kernels.gaussian import LOG_NOTHING
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.rows import add_row
 
 # Adaptive moments: the elliptical Gaussian weight W that matches what it
@@ -15,7 +15,7 @@ from photutils_mgauss.kernels.rows import add_row
 MOMENTS_CONVERGED, MOMENTS_STOPPED, MOMENTS_EMPTY, MOMENTS_DIVERGED = range(4)
 
 
-@kernel
+@inner
 def _row_of(state, row):
     """Put the Gaussian of unit peak that a state describes into row (6,)."""
     x, y, xx, xy, yy = state
@@ -25,7 +25,7 @@ def _row_of(state, row):
     row[5] = 1 / yy
 
 
-@kernel
+@inner
 def _image_sums(image, used, fill, row, line, sums):
     """
     Sum an image under the weight of a row; unused pixels hold fill * W.
@@ -56,7 +56,7 @@ def _image_sums(image, used, fill, row, line, sums):
         sums[5] += v * v * s0
 
 
-@kernel
+@inner
 def _mixture_sums(mixture, state, sums):
     """Integrate a mixture (K, 6: weight, x, y, xx, xy, yy) under a state."""
     x, y, xx, xy, yy = state
@@ -86,7 +86,7 @@ def _mixture_sums(mixture, state, sums):
         sums[5] += h * (xy * wx + yy * wy + v * v)
 
 
-@kernel
+@inner
 def _adapt(state, sums, largest):
     """
     Move the state towards the match; return its relative change.
@@ -131,7 +131,7 @@ def _adapt(state, sums, largest):
     return change
 
 
-@kernel
+@inner
 def _ending(change):
     if change == -1.0:
         return MOMENTS_EMPTY

@@ -11,11 +11,11 @@ from photutils_mgauss.kernels.gaussian import (
     NOTHING,
     count_panels,
 )
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel
 
 # Mixtures on a pixel lattice.
 
-@kernel
+@inner
 def add_row(peak, u0, p, out):
     """
     Add peak * exp(-p u^2 / 2) for u = u0, u0 + 1, ... to out (n,).
@@ -50,7 +50,7 @@ def add_row(peak, u0, p, out):
         out[i] += g
 
 
-@kernel
+@inner
 def add_integrated_row(peak, dx, dy, p, s, q, out):
     """Add the pixel integrals of one row; dx is the offset of its first."""
     panels = count_panels(p, s, q)

@@ -8,7 +8,7 @@ from photutils_mgauss.kernels.gaussian import (
     NOTHING,
     fast_exp,
 )
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.rows import add_row
 
 _LOG_2PI = float(np.log(2 * np.pi))
@@ -32,7 +32,7 @@ def draw_unit(shapes, cx, cy, lanes, images):
 _STEEP = 600.0
 
 
-@kernel
+@inner
 def _is_steep(shape, cx, cy, size):
     """
     Return whether a walk along columns leaves the range of numbers.
@@ -50,7 +50,7 @@ def _is_steep(shape, cx, cy, size):
                 and (abs(t) <= m or square <= 2 * _STEEP))
 
 
-@kernel
+@inner
 def _draw_by_rows(shape, cx, cy, image):
     mx, my, log_l, t, log_m = shape
     length, m = exp(log_l), exp(log_m)
@@ -65,7 +65,7 @@ def _draw_by_rows(shape, cx, cy, image):
                     length * length, row)
 
 
-@kernel
+@inner
 def _draw_by_columns(shape, cx, cy, lanes, image):
     """
     Draw all columns at once, from the row of the mean up and down.
@@ -97,7 +97,7 @@ def _draw_by_columns(shape, cx, cy, lanes, image):
     _walk_columns(start - 1, -1, -1, fall, lower, down, image)
 
 
-@kernel
+@inner
 def _walk_columns(start, end, way, fall, value, quotient, image):
     """Put value (nx,) into rows start, start + way, ... before end."""
     for j in range(start, end, way):
@@ -109,7 +109,7 @@ def _walk_columns(start, end, way, fall, value, quotient, image):
             quotient[i] *= fall
 
 
-@kernel
+@inner
 def _columns_of_product(a, b, weight, cy, columns):
     """Put sum_y w a b y^m into columns[m, x], m <= 4."""
     ny, nx = a.shape
@@ -141,7 +141,7 @@ def _columns_of_product(a, b, weight, cy, columns):
             c4[i] += g * (v * v * v * v)
 
 
-@kernel
+@inner
 def moments_of_product(a, b, weight, cx, cy, columns, out):
     """
     Put sum_pixels w a b x^n y^m into out[n, m], n + m <= 4.
@@ -170,7 +170,7 @@ def moments_of_product(a, b, weight, cx, cy, columns, out):
     out[3, 0], out[3, 1], out[4, 0] = d0, d1, e0
 
 
-@kernel
+@inner
 def low_moments(a, b, centre, columns, sums):
     """
     Put sum_pixels a b (1, x, y, xx, xy, yy) into sums (6,).
@@ -196,7 +196,7 @@ def low_moments(a, b, centre, columns, sums):
     sums[3], sums[4], sums[5] = s3, s4, s5
 
 
-@kernel
+@inner
 def derivative_polynomials(shape, out):
     """
     Put g and its derivatives by the five shape numbers into out (6, 6).
@@ -237,7 +237,7 @@ _POWER_X = np.array([0, 1, 0, 2, 1, 0])
 _POWER_Y = np.array([0, 0, 1, 0, 1, 2])
 
 
-@kernel
+@inner
 def contract(left, moments, right, half, out):
     """
     Put the moments of a product, seen by its parameters, into out (6, 6).

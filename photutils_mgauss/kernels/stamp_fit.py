@@ -3,7 +3,7 @@ from math import exp
 
 import numpy as np
 
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import (
     _factor,
     _solve_factored,
@@ -42,7 +42,7 @@ _NARROW, _WIDE, _REACH_X, _REACH_Y, _STIFFNESS = range(5)
 FIT_CONVERGED, FIT_STOPPED = range(2)
 
 
-@kernel
+@inner
 def _hinge(excess, slopes, stiffness, matrix, gradient):
     """Add the square of an excess > 0 to the normal equations of one shape."""
     if excess <= 0:
@@ -93,7 +93,7 @@ def penalty(shape, limits, matrix, gradient):
     return price
 
 
-@kernel
+@inner
 def _residual(stamp, images, fluxes, out):
     """Put stamp minus model into out (ny, nx)."""
     for j in range(stamp.shape[0]):
@@ -140,7 +140,7 @@ def project(stamp, weight, centre, shapes, tie, signed, rows, fluxes,
 # Sums over pixels are taken column by column first: the compiler makes
 # vectors of such sums, which it must not of a single one.
 
-@kernel
+@inner
 def _weighted_dot(a, b, weight, lane):
     """Return sum_pixels w a b; lane (nx,) is scratch."""
     lane[:] = 0.0
@@ -150,7 +150,7 @@ def _weighted_dot(a, b, weight, lane):
     return lane.sum()
 
 
-@kernel
+@inner
 def _dot(a, b, lane):
     """Return sum_pixels a b; lane (nx,) is scratch."""
     lane[:] = 0.0
@@ -160,7 +160,7 @@ def _dot(a, b, lane):
     return lane.sum()
 
 
-@kernel
+@inner
 def _add_rows_to_fluxes(rows, stamp, images, lane, gram, rhs):
     """Add rows (m, ny, nx) over the residual to the equations of fluxes."""
     seen = np.empty(images.shape[0])
@@ -174,7 +174,7 @@ def _add_rows_to_fluxes(rows, stamp, images, lane, gram, rhs):
                 gram[k, other] += seen[k] * seen[other]
 
 
-@kernel
+@inner
 def _add_rows(rows, centre, residual, images, fluxes, polynomials, columns,
               matrix, gradient):
     """Add rows (m, ny, nx) over the residual to the normal equations."""
@@ -191,7 +191,7 @@ def _add_rows(rows, centre, residual, images, fluxes, polynomials, columns,
                 matrix[i, j] += slopes[i] * slopes[j]
 
 
-@kernel
+@inner
 def _put_slopes(polynomials, sums, k, fluxes, slopes):
     """Put the slopes by the numbers of Gaussian k into slopes (6K,)."""
     for i in range(6):
@@ -234,13 +234,13 @@ def normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
                   columns, matrix, gradient)
 
 
-@kernel
+@inner
 def _unknown(n, k, i):
     """Return where number i (0: flux) of Gaussian k of n is stored."""
     return k if i == 0 else n + 5 * k + i - 1
 
 
-@kernel
+@inner
 def _place(block, k, other, fluxes, matrix):
     """Write the 6x6 block of two Gaussians into the normal matrix."""
     n = fluxes.size
@@ -267,7 +267,7 @@ def add_penalties(shapes, limits, matrix, gradient):
     return price
 
 
-@kernel
+@inner
 def _step(matrix, gradient, fluxes, damping, fixed_means, factor, step):
     """
     Put the damped step of all unknowns into step (6K,).
@@ -305,7 +305,7 @@ def _step(matrix, gradient, fluxes, damping, fixed_means, factor, step):
     return gain
 
 
-@kernel
+@inner
 def _uncouple_means(n, factor):
     for k in range(n):
         for c in range(2):
@@ -314,7 +314,7 @@ def _uncouple_means(n, factor):
                 factor[j, i] = 0.0
 
 
-@kernel
+@inner
 def _move(shapes, step, out):
     """Put shapes moved by the step into out, no width by more than e-fold."""
     n = shapes.shape[0]
@@ -326,7 +326,7 @@ def _move(shapes, step, out):
             out[k, i] = shapes[k, i] + change
 
 
-@kernel
+@inner
 def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed, rows,
                fixed_means, limits, tolerance, max_steps, scratch, matrices,
                vectors):

@@ -11,7 +11,7 @@ from photutils_mgauss.kernels.descent import (
     next_damping,
     remainder,
 )
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import _factorize, _solve
 from photutils_mgauss.kernels.tile import LANES, fill_jet
 
@@ -46,7 +46,7 @@ def count_pixels(mask, boxes, out):
         out[i] = n
 
 
-@kernel
+@inner
 def _gather(image, error, mask, box, sky, data, variance):
     """
     Copy the pixels of a box less its sky, column after column.
@@ -76,7 +76,7 @@ def _gather(image, error, mask, box, sky, data, variance):
     return n
 
 
-@kernel
+@inner
 def _weigh(data, variance, sky, gain, old, residual, weight, chi2):
     """
     Turn the model of the stars in residual into residuals, and weigh them.
@@ -102,7 +102,7 @@ def _weigh(data, variance, sky, gain, old, residual, weight, chi2):
     chi2[1] += with_new
 
 
-@kernel
+@inner
 def _add_gradient(jet, flux, weight, residual, gradient):
     """Add a star's part of the right-hand side in one box."""
     b0 = 0.0
@@ -118,7 +118,7 @@ def _add_gradient(jet, flux, weight, residual, gradient):
     gradient[2] += flux * b2
 
 
-@kernel
+@inner
 def _add_block(one, flux_1, two, flux_2, weight, block):
     """Add the 3 x 3 block of the normal matrix that joins two stars."""
     a00 = 0.0
@@ -155,7 +155,7 @@ def _add_block(one, flux_1, two, flux_2, weight, block):
     block[2, 2] += flux_1 * flux_2 * a22
 
 
-@kernel
+@inner
 def _add_sky(jet, flux, weight, column):
     """Add what joins a star and the sky level, in one box."""
     for i in range(weight.size):
@@ -164,7 +164,7 @@ def _add_sky(jet, flux, weight, column):
         column[2] += weight[i] * jet[2, i] * flux
 
 
-@kernel
+@inner
 def _model_stars(parameters, n, box, psf, scratch, residual):
     """
     Put the sum of n stars in a box into residual.
@@ -186,7 +186,7 @@ def _model_stars(parameters, n, box, psf, scratch, residual):
         seen[s] = top > _UNSEEN
 
 
-@kernel
+@inner
 def _add_equations(parameters, n, fit_sky, jets, seen, weight, residual,
                    matrix, gradient):
     """Add what one box contributes to the normal equations of a group."""
@@ -211,7 +211,7 @@ def _add_equations(parameters, n, fit_sky, jets, seen, weight, residual,
             gradient[sky] += weight[i] * residual[i]
 
 
-@kernel
+@inner
 def _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
                       chi2):
     """
@@ -239,7 +239,7 @@ def _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
                        matrix, gradient)
 
 
-@kernel
+@inner
 def _freeze(parameters, lower, upper, gradient, fixed, size, frozen):
     """Freeze fixed parameters and those that press against a bound."""
     for a in range(size):
@@ -248,7 +248,7 @@ def _freeze(parameters, lower, upper, gradient, fixed, size, frozen):
             parameters[a] >= upper[a] and gradient[a] > 0)
 
 
-@kernel
+@inner
 def _step_size(step, parameters, matrix, n):
     """
     Return the largest relative step of a group.
@@ -266,7 +266,7 @@ def _step_size(step, parameters, matrix, n):
     return size
 
 
-@kernel
+@inner
 def _undamp(step, matrix, gradient, frozen, size):
     """Lengthen a damped step to what each parameter alone would go."""
     for a in range(size):
@@ -274,7 +274,7 @@ def _undamp(step, matrix, gradient, frozen, size):
             step[a] = max(abs(step[a]), abs(gradient[a]) / matrix[a, a])
 
 
-@kernel
+@inner
 def _take_step(parameters, step, lower, upper, n, size, trial):
     """Put the bounded end of the step into trial, the actual into step."""
     for s in range(n):
@@ -287,7 +287,7 @@ def _take_step(parameters, step, lower, upper, n, size, trial):
         step[a] = trial[a] - parameters[a]
 
 
-@kernel
+@inner
 def _expected(step, matrix, gradient, size):
     """Return by how much the linear model says chi2 falls."""
     total = 0.0
@@ -299,7 +299,7 @@ def _expected(step, matrix, gradient, size):
     return total
 
 
-@kernel
+@inner
 def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
               limits, max_iterations, chi2):
     """
@@ -363,7 +363,7 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
             max_iterations + 1)
 
 
-@kernel
+@inner
 def _covariances(matrix, fixed, n, size, work, out):
     """
     Put each star's 3 x 3 block of the inverse matrix into out (n, 3, 3).
@@ -390,7 +390,7 @@ def _covariances(matrix, fixed, n, size, work, out):
     return step[size - 1]
 
 
-@kernel
+@inner
 def _measure_fit(x_init, y_init, boxes, weights, residuals, n, out):
     """
     Put three sums of each star's box into out (n, 3).
@@ -417,7 +417,7 @@ def _measure_fit(x_init, y_init, boxes, weights, residuals, n, out):
         out[s, 2] = squares
 
 
-@kernel
+@inner
 def _load_group(image, error, mask, stars, fixed, parameters, limits, data,
                 variance):
     """
@@ -446,7 +446,7 @@ def _load_group(image, error, mask, stars, fixed, parameters, limits, data,
     return n_pixels
 
 
-@kernel
+@inner
 def _scatter(sums, n_pixels, n_free):
     """Return the variance of residuals, NaN without degrees of freedom."""
     return sums[:, 2].sum() / (n_pixels - n_free) if (

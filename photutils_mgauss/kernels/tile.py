@@ -9,7 +9,7 @@ from photutils_mgauss.kernels.gaussian import (
     point_value,
 )
 from photutils_mgauss.kernels.grid import blend_weights
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel, loop
 
 # The PSF of a star and its derivatives by position are summed in a tile, one
 # flat array: for each pixel column _LANES values of the PSF, as many of its
@@ -42,7 +42,7 @@ def strides(nodes, out):
             out[m, k, 3] = exp(-p)
 
 
-@kernel
+@loop
 def _walk_starts(a, dx, dy, p, s, q, pace, by_x, by_y, height, walk):
     """
     Put what a walk along the columns starts from into walk (4, _LANES) flat.
@@ -85,7 +85,7 @@ def _walk_starts(a, dx, dy, p, s, q, pace, by_x, by_y, height, walk):
     return True
 
 
-@kernel
+@loop
 def _add_walk(p, s, fall, width, walk, tile):
     """Add a Gaussian to a tile, two multiplications a pixel."""
     for i in range(width):
@@ -102,7 +102,7 @@ def _add_walk(p, s, fall, width, walk, tile):
             walk[LANES + j] = r * fall
 
 
-@kernel
+@inner
 def _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height, width,
                 tile):
     """Add a Gaussian to a tile, each pixel for itself."""
@@ -117,7 +117,7 @@ def _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height, width,
             tile[k + 2 * LANES] += by_y * g - a * gy
 
 
-@kernel
+@inner
 def add_gaussian(a, dx, dy, p, s, q, pace, by_x, by_y, integrated, height,
                  width, walk, tile):
     """
@@ -138,7 +138,7 @@ def add_gaussian(a, dx, dy, p, s, q, pace, by_x, by_y, integrated, height,
         _add_walk(p, s, pace[3], width, walk, tile)
 
 
-@kernel
+@inner
 def _fill_tile(x_0, y_0, row, column, height, width, psf, tiling):
     """Put the PSF and its derivatives in up to _LANES rows into the tile."""
     nodes, strides, _, _, integrated = psf
@@ -158,7 +158,7 @@ def _fill_tile(x_0, y_0, row, column, height, width, psf, tiling):
                              integrated, height, width, walk, tile)
 
 
-@kernel
+@inner
 def fill_jet(x_0, y_0, box, psf, tiling, jet):
     """
     Put the unit-flux PSF in a box and its derivatives by x_0 and y_0.

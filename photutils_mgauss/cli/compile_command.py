@@ -1,0 +1,111 @@
+"""``mgauss compile``: every compiled function, made before it is needed."""
+import time
+import warnings
+
+import numpy as np
+
+from photutils_mgauss.cli import tools
+
+
+def add(commands):
+    """Add the command to the parser's."""
+    parser = tools.command(
+        commands, 'compile', 'compile all fits once, before they are needed',
+        'Compile everything that the package would compile at the first call '
+        'of each kind,\nand keep it: for the image of a container, for the '
+        'workers of a cluster that\nshare a folder (NUMBA_CACHE_DIR), or to '
+        'wait now rather than later.', 'mgauss compile', run)
+    parser.add_argument('--quiet', action='store_true', help='print nothing')
+
+
+def run(options):
+    """Compile everything and say what was done."""
+    from photutils_mgauss.kernels import jit
+
+    total = 0.0
+    for words, call in examples():
+        start = time.perf_counter()
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            call()
+        seconds = time.perf_counter() - start
+        total += seconds
+        tools.say(options, f'{words:40} {seconds:6.1f} s')
+    ready = [name for name, one in jit.KERNELS.items() if one.signatures]
+    where = jit.folder()
+    tools.say(options, f'{len(ready)} functions ready in {total:.1f} s, '
+              + (f'kept in {where}' if where else 'not kept: no folder for '
+                 'them can be written, see NUMBA_CACHE_DIR'))
+
+
+def examples():
+    """Yield (words, call) for calls that need all kernels between them."""
+    import photutils_mgauss as package
+
+    psf, data, error, stars = _scene(package)
+    stamp = psf.mixture_at(20, 20).render((15, 15), 7, 7)
+    integrated = package.GriddedMixturePSF(
+        psf.mixtures, psf.grid_xypos, pixel_integrated=True,
+        interpolation='components')
+    yield 'photometry', lambda: [
+        package.MixturePSFPhotometry(one, (5, 5), aperture_radius=3)(
+            data, error=error, init_params=stars)
+        for one in (psf, integrated)]
+    yield 'models and errors', lambda: _use_models(package, psf, integrated,
+                                                   data, error)
+    yield 'mixtures of PSF images', lambda: [
+        package.fit_mixture(stamp, 2, oversampling=2, weighting=weighting)
+        for weighting in ('uniform', 'astrometric')]
+    yield 'moments', lambda: [package.adaptive_moments(one) for one in (
+        stamp, psf.mixture_at(0, 0))]
+    yield 'PSF of stars', lambda: package.fit_mixture_field(
+        data, stars, error=error, n_components=1, degree=0)
+    yield 'crowded fields', lambda: package.CrowdedMixturePhotometry(psf)(
+        data, error=error)
+    yield 'simulated images', lambda: _simulate(package, psf, integrated)
+
+
+def _scene(package):
+    """Return a PSF, and 16 stars of it with noise."""
+    mixture = package.GaussianMixture.from_stddevs(
+        [0.8, 0.2], np.zeros((2, 2)), [(1.2, 1.1), (2, 2.1)], [0.1, 0])
+    corners = [(0, 0), (99, 0), (0, 99), (99, 99)]
+    psf = package.GriddedMixturePSF([mixture] * 4, corners)
+    y, x = np.mgrid[20:100:20, 20:100:20].reshape(2, -1)
+    from astropy.table import QTable
+    stars = QTable({'x_0': x + 0.3, 'y_0': y - 0.2,
+                    'flux': np.full(x.size, 5e4)})
+    data = package.render_stars(psf, x + 0.3, y - 0.2, stars['flux'],
+                                (100, 100))
+    error = np.sqrt(data + 25)
+    data = data + np.random.default_rng(1).normal(0, error)
+    return psf, data, error, stars
+
+
+def _use_models(package, psf, integrated, data, error):
+    """Evaluate all models, and fit with photutils and in many images."""
+    from photutils.psf import PSFPhotometry
+
+    y, x = np.mgrid[:9, :9]
+    single = package.MultiGaussianPSFModel(psf.mixtures[0])
+    for model in (psf, integrated, single):
+        model.evaluate(x, y, 1.0, 4.0, 4.0)
+        model.fit_deriv(x.ravel(), y.ravel(), 1.0, 4.0, 4.0,
+                        *model.parameters[3:])
+        package.cramer_rao(model, 1e4, 5.0, x=20.0, y=20.0)
+    for grid in (psf, integrated):
+        grid.render([3.2], [4.1], 100, 9)
+    psf.mixtures[0].gradient(x, y)
+    psf.mixtures[0].render((9, 9), 4, 4)
+    from astropy.table import QTable
+    PSFPhotometry(psf, (5, 5), fitter=package.MixtureFitter(),
+                  aperture_radius=3)(
+        data, error=error,
+        init_params=QTable({'x': [20.3], 'y': [19.8], 'flux': [5e4]}))
+
+
+def _simulate(package, psf, integrated):
+    """Draw stars with every kind of PSF."""
+    star = [20.3], [30.1], [1e4]
+    for one in (psf, integrated, psf.to_gridded_psf(radius=5)):
+        package.render_stars(one, *star, (60, 60))

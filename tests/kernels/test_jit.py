@@ -1,0 +1,136 @@
+"""Compiled code: kept, noticed when it is out of date, and done without."""
+import ast
+import os
+import pty
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import photutils_mgauss
+from photutils_mgauss import kernels
+from photutils_mgauss.kernels import jit
+
+PACKAGE = Path(photutils_mgauss.__file__).parent
+SOURCES = sorted((PACKAGE / 'kernels').glob('*.py'))
+# evaluate_grid stands in grid.py and calls add_values of gaussian.py.
+CODE = """
+import numpy as np
+from photutils_mgauss import GaussianMixture, GriddedMixturePSF
+mixture = GaussianMixture([1], [[0, 0]], [np.eye(2)])
+psf = GriddedMixturePSF([mixture], [(0, 0)])
+print(round(float(psf.evaluate(3.0, 4.0, 2 * np.pi, 3.0, 4.0)), 6))
+"""
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """Return a copy of the package whose compiled code is its own."""
+    folder = tmp_path / 'site' / 'photutils_mgauss'
+    shutil.copytree(PACKAGE, folder,
+                    ignore=shutil.ignore_patterns('__pycache__'))
+    return folder
+
+
+def run(copy, stderr=subprocess.PIPE, **environment):
+    """Return what a process prints that uses a copy of the package."""
+    clean = {name: value for name, value in os.environ.items()
+             if not name.startswith('NUMBA_')}
+    return subprocess.run(
+        [sys.executable, '-c', CODE], text=True, check=True, stderr=stderr,
+        stdout=subprocess.PIPE,
+        env={**clean, 'PYTHONPATH': str(copy.parent), 'PYTHONSAFEPATH': '1',
+             **environment})
+
+
+def edit(path, old, new):
+    text = path.read_text(encoding='utf-8')
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new), encoding='utf-8')
+
+
+def test_an_edit_of_a_function_called_from_another_file_is_noticed(
+        copy, tmp_path):
+    cache = {'NUMBA_CACHE_DIR': str(tmp_path / 'cache')}
+    assert run(copy, **cache).stdout.strip() == '1.0'
+    assert list((tmp_path / 'cache').rglob('*.nbc'))
+    edit(copy / 'kernels' / 'gaussian.py',
+         'return exp(-0.5 * (p * u * u + q * dy * dy))',
+         'return 3.0 * exp(-0.5 * (p * u * u + q * dy * dy))')
+    assert run(copy, **cache).stdout.strip() == '3.0'
+
+
+def test_without_a_folder_for_it_code_is_compiled_and_one_warning_given(
+        copy, tmp_path):
+    for place in (copy, *(p for p in copy.rglob('*') if p.is_dir())):
+        (place / '__pycache__').write_text('')
+    wall = tmp_path / 'file'
+    wall.write_text('')
+    result = run(copy, HOME=str(wall / 'home'),
+                 XDG_CACHE_HOME=str(wall / 'cache'),
+                 PYTHONDONTWRITEBYTECODE='1')
+    assert result.stdout.strip() == '1.0'
+    assert result.stderr.count('UserWarning') == 1
+    assert 'NUMBA_CACHE_DIR' in result.stderr
+
+
+def test_damaged_files_are_compiled_anew(copy, tmp_path):
+    cache = {'NUMBA_CACHE_DIR': str(tmp_path / 'cache')}
+    run(copy, **cache)
+    for path in (tmp_path / 'cache').rglob('*.nb[ci]'):
+        path.write_bytes(path.read_bytes()[:99])
+    result = run(copy, **cache)
+    assert result.stdout.strip() == '1.0'
+    assert result.stderr.count('UserWarning') <= 1
+
+
+def test_who_waits_at_a_terminal_is_told_once(copy, tmp_path):
+    slow = copy / 'kernels' / 'jit.py'
+    edit(slow, '_PATIENCE = 1.0', '_PATIENCE = 0.01')
+    said = []
+    for _ in range(2):
+        leader, follower = pty.openpty()
+        run(copy, stderr=follower, NUMBA_CACHE_DIR=str(tmp_path / 'cache'))
+        os.close(follower)
+        said.append(_read(leader))
+        os.close(leader)
+    assert said[0].count('compiling (once per installation)') == 1
+    assert said[1] == ''
+
+
+def _read(leader):
+    try:
+        return os.read(leader, 10000).decode()
+    except OSError:  # nothing was written
+        return ''
+
+
+def test_nothing_is_told_where_output_is_no_terminal(copy, tmp_path):
+    edit(copy / 'kernels' / 'jit.py', '_PATIENCE = 1.0', '_PATIENCE = 0.01')
+    result = run(copy, NUMBA_CACHE_DIR=str(tmp_path / 'cache'))
+    assert result.stderr == ''
+
+
+@pytest.mark.parametrize('path', SOURCES, ids=lambda path: path.stem)
+def test_only_one_module_names_numba(path):
+    tree = ast.parse(path.read_text(encoding='utf-8'))
+    modules = {name.name for node in ast.walk(tree)
+               if isinstance(node, ast.Import) for name in node.names}
+    modules |= {node.module for node in ast.walk(tree)
+                if isinstance(node, ast.ImportFrom)}
+    assert path.stem == 'jit' or not any(
+        name.startswith('numba') for name in modules)
+
+
+def test_no_module_outside_the_room_names_numba():
+    assert [path for path in PACKAGE.rglob('*.py')
+            if path not in SOURCES
+            and 'import numba' in path.read_text(encoding='utf-8')] == []
+
+
+def test_what_is_compiled_for_python_is_handed_on():
+    for name in set(kernels.__all__):
+        getattr(kernels, name)
+    assert set(jit.KERNELS) <= set(kernels.__all__)
