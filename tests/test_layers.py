@@ -11,7 +11,8 @@ import pytest
 import photutils_mgauss
 
 PACKAGE = Path(photutils_mgauss.__file__).parent
-TABLE = Path(__file__).parents[1] / 'docs' / 'layers.csv'
+TESTS = Path(__file__).parent
+TABLE = TESTS.parent / 'docs' / 'layers.csv'
 SLOW = ('pymc', 'pytensor', 'arviz', 'matplotlib.pyplot')
 SKY_PACKAGES = ('gwcs', 'astropy.coordinates', 'astropy.time', 'astropy.wcs')
 
@@ -135,6 +136,20 @@ def test_no_module_is_long(name):
 @pytest.mark.parametrize('name', MODULES)
 def test_imports_go_downward(name):
     assert upward_imports(name, parse(name)) == []
+
+
+def test_tests_stand_in_the_rooms_of_what_they_test():
+    folders = {path.parent.name for path in TESTS.glob('*/test_*.py')}
+    assert folders <= ROWS.keys()
+
+
+@pytest.mark.parametrize('path', [
+    pytest.param(path, id=path.stem) for path in TESTS.rglob('*.py')])
+def test_no_test_module_is_imported(path):
+    names = [name for node in ast.walk(ast.parse(path.read_text('utf-8')))
+             for name in imported_names(node)]
+    assert not [name for name in names if name.startswith('test_')
+                or '.test_' in name]
 
 
 def test_no_two_modules_import_each_other():
