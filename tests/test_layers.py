@@ -4,6 +4,8 @@ import csv
 import subprocess
 import sys
 from graphlib import TopologicalSorter
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -13,11 +15,14 @@ import photutils_mgauss
 PACKAGE = Path(photutils_mgauss.__file__).parent
 TESTS = Path(__file__).parent
 TABLE = TESTS.parent / 'docs' / 'layers.csv'
+WALK = TABLE.with_name('walk.csv')
 SLOW = ('pymc', 'pytensor', 'arviz', 'matplotlib.pyplot')
 SKY_PACKAGES = ('gwcs', 'astropy.coordinates', 'astropy.time', 'astropy.wcs')
 
 with TABLE.open(newline='') as file:
     LINES = list(csv.DictReader(file))
+with WALK.open(newline='') as file:
+    STATIONS = [(row['Module'], row['Call']) for row in csv.DictReader(file)]
 ROWS = {row['Room']: row for row in LINES}
 FLOORS = {name: int(row['Floor']) for name, row in ROWS.items()}
 # One star in many images: the only module that needs both halves.
@@ -136,6 +141,12 @@ def test_no_module_is_long(name):
 @pytest.mark.parametrize('name', MODULES)
 def test_imports_go_downward(name):
     assert upward_imports(name, parse(name)) == []
+
+
+@pytest.mark.parametrize(('name', 'call'), STATIONS)
+def test_the_walk_through_the_house_leads_through_real_doors(name, call):
+    module = import_module(f'photutils_mgauss.{name.replace("/", ".")}')
+    assert attrgetter(call)(module).__module__ == module.__name__
 
 
 def test_tests_stand_in_the_rooms_of_what_they_test():
