@@ -43,6 +43,12 @@ Each figure is made by the script on its page, from nothing but simulations.
 .. container:: gallery
 
 {entries}
+Several scripts begin with the same simulations, which they import from
+``docs/gallery_scenes.py``:
+
+.. literalinclude:: ../../gallery_scenes.py
+   :language: python
+
 .. toctree::
    :hidden:
 

@@ -3,7 +3,10 @@ from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import get_body_barycentric
+from astropy.coordinates import (
+    UnitSphericalRepresentation,
+    get_body_barycentric,
+)
 from astropy.table import Table
 from astropy.time import Time
 
@@ -37,13 +40,11 @@ class Truth:
 
     def at(self, year):
         """Return ra, dec [deg] seen from the Earth, by unit vectors."""
-        a, d = np.radians(self.ra), np.radians(self.dec)
-        zero = np.zeros_like(a)
-        r = np.stack([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a),
-                      np.sin(d)])
-        p = np.stack([-np.sin(a), np.cos(a), zero])
-        q = np.stack([-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a),
-                      np.cos(d)])
+        places = UnitSphericalRepresentation(self.ra * u.deg,
+                                             self.dec * u.deg)
+        axes = places.unit_vectors()
+        r, p, q = (one.to_cartesian().xyz.value
+                   for one in (places, axes['lon'], axes['lat']))
         mas = np.radians(1 / 3.6e6)
         earth = get_body_barycentric('earth', Time(
             year, format='jyear', scale='tdb'), ephemeris='builtin')

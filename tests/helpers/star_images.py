@@ -2,7 +2,11 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
-from photutils_mgauss import GaussianMixture
+from photutils_mgauss import GaussianMixture, MultiGaussianPSFModel
+
+MIXTURE = GaussianMixture.from_stddevs(
+    [0.7, 0.3], [[0, 0], [0.1, 0]], [[0.9, 0.85], [1.9, 2.1]], [0.1, 0])
+PSF = MultiGaussianPSFModel(MIXTURE)
 
 
 def narrow_mixture(k):
