@@ -3,6 +3,7 @@ import ast
 import csv
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from importlib import import_module
 from operator import attrgetter
@@ -43,6 +44,7 @@ def room_of(name):
     return name.partition('/')[0]
 
 
+@cache
 def parse(name):
     return ast.parse(MODULES[name].read_text(encoding='utf-8'))
 
