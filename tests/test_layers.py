@@ -23,7 +23,8 @@ SKY_PACKAGES = ('gwcs', 'astropy.coordinates', 'astropy.time', 'astropy.wcs')
 with TABLE.open(newline='') as file:
     LINES = list(csv.DictReader(file))
 with WALK.open(newline='') as file:
-    STATIONS = [(row['Module'], row['Call']) for row in csv.DictReader(file)]
+    STATIONS = [(row['Module'].strip('`'), row['Call'].strip('`'))
+                for row in csv.DictReader(file)]
 ROWS = {row['Room']: row for row in LINES}
 FLOORS = {name: int(row['Floor']) for name, row in ROWS.items()}
 # One star in many images: the only module that needs both halves.
