@@ -8,6 +8,7 @@ inventories can be read (``MGAUSS_INTERSPHINX=1``) and are plain text
 otherwise.
 """
 import datetime as dt
+import inspect
 import os
 import sys
 from pathlib import Path
@@ -25,7 +26,7 @@ version = '.'.join(release.split('.')[:2])
 
 sys.path.insert(0, str(Path(__file__).parent))
 extensions.remove('sphinx.ext.todo')
-extensions.append('make_gallery')
+extensions += ['make_gallery', 'make_house']
 exclude_patterns = ['_build', '**.ipynb_checkpoints']
 html_title = f'{project} {release}'
 html_static_path = ['_static']
@@ -39,6 +40,22 @@ rst_prolog = '.. currentmodule:: photutils_mgauss'
 numpydoc_xref_param_type = False
 automodsumm_inherited_members = False
 
+
+def _take_over(owner):
+    """Give a class the public members of its bases in this package."""
+    for base in owner.__mro__[1:]:
+        if base.__module__.startswith('photutils_mgauss.'):
+            for name in {*vars(base)} - {*vars(owner)}:
+                if not name.startswith('_'):
+                    setattr(owner, name, vars(base)[name])
+
+
+# automodapi lists either what stands in a class itself or all it inherits,
+# also from astropy. Readers want what this package has written.
+for _name in photutils_mgauss.__all__:
+    if inspect.isclass(_member := getattr(photutils_mgauss, _name)):
+        _take_over(_member)
+
 if os.environ.get('MGAUSS_INTERSPHINX') == '1':
     intersphinx_mapping |= {
         'photutils': ('https://photutils.readthedocs.io/en/stable/', None),
@@ -50,13 +67,14 @@ else:
 # Names of other packages and of the standard library, by their first word.
 _others = (
     'numpy np scipy astropy photutils gwcs pymc arviz xarray galsim numba '
-    'matplotlib asdf concurrent collections enum functools pathlib typing')
+    'matplotlib asdf concurrent collections copy enum functools pathlib '
+    'typing')
 _plain = (
     'bool bytes callable complex dict float frozenset int list object '
     'property range set slice str tuple type None True False')
 nitpick_ignore_regex = [
-    # The base classes of public ones may be private.
-    ('py:.*', r'photutils_mgauss\._.*'),
+    # The base classes of public ones are known to their rooms only.
+    ('py:.*', r'photutils_mgauss\.\w+\.\w+\.\w+'),
     ('py:.*', rf'({"|".join(_others.split())})(\..*)?'),
     ('py:.*', '|'.join(_plain.split())),
     ('py:.*', '[A-Z][A-Za-z]*(Error|Warning)'),

@@ -43,6 +43,12 @@ Each figure is made by the script on its page, from nothing but simulations.
 .. container:: gallery
 
 {entries}
+Several scripts begin with the same simulations, which they import from
+``docs/gallery_scenes.py``:
+
+.. literalinclude:: ../../gallery_scenes.py
+   :language: python
+
 .. toctree::
    :hidden:
 
@@ -56,7 +62,7 @@ def build(app):
     folder.mkdir(parents=True, exist_ok=True)
     scripts = sorted((Path(app.srcdir) / 'gallery').glob('*.py'))
     titles = {script.stem: _page(script, folder) for script in scripts}
-    _write(folder / 'index.rst', INDEX.format(
+    write(folder / 'index.rst', INDEX.format(
         entries=''.join(ENTRY.format(name=name, title=title)
                         for name, title in titles.items()),
         names=textwrap.indent('\n'.join(titles), '   ')))
@@ -71,7 +77,7 @@ def _page(script, folder):
     code = script.read_text(encoding='utf-8')
     tree = ast.parse(code)
     title, _, text = ast.get_docstring(tree).partition('.\n')
-    _write(folder / f'{script.stem}.rst', PAGE.format(
+    write(folder / f'{script.stem}.rst', PAGE.format(
         title=title, line='=' * len(title), name=script.stem,
         text=text.strip(), script=f'../../gallery/{script.name}',
         first=tree.body[0].end_lineno + 1))
@@ -102,7 +108,7 @@ def _check(figure, script):
                 raise ValueError(msg)
 
 
-def _write(path, text):
+def write(path, text):
     """Write a file unless it says the same already."""
     if not path.exists() or path.read_text(encoding='utf-8') != text:
         path.write_text(text, encoding='utf-8')

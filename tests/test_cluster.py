@@ -5,8 +5,8 @@ import warnings
 
 import pytest
 from numpy.testing import assert_array_equal
-from psf_grids import assert_is_truth, epsf_grid
 
+from helpers.psf_grids import assert_is_truth, epsf_grid
 from photutils_mgauss import GriddedMixturePSF
 
 distributed = pytest.importorskip('distributed')

@@ -18,9 +18,17 @@ def sections(documented):
     return {'': parts[0]} | dict(zip(parts[1::2], parts[2::2], strict=True))
 
 
+def own_members(owner):
+    """Return what a class and its bases in this package define, by name."""
+    bases = [base for base in reversed(owner.__mro__)
+             if base.__module__.startswith('photutils_mgauss.')]
+    return {name: member for base in bases
+            for name, member in vars(base).items()}
+
+
 def own_methods(owner):
     """Yield name and function of the public methods that a class defines."""
-    for name, member in vars(owner).items():
+    for name, member in own_members(owner).items():
         function = getattr(member, '__func__', member)
         if not name.startswith('_') and inspect.isfunction(function):
             yield name, function
@@ -31,7 +39,7 @@ METHODS = {f'{name}.{method}': function
            for method, function in own_methods(owner)}
 PROPERTIES = {f'{name}.{attribute}': member
               for name, owner in OBJECTS.items() if inspect.isclass(owner)
-              for attribute, member in vars(owner).items()
+              for attribute, member in own_members(owner).items()
               if type(member) is property
               and not attribute.startswith('_')}
 FUNCTIONS = {name: function for name, function in OBJECTS.items()

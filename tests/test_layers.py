@@ -3,7 +3,10 @@ import ast
 import csv
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -11,12 +14,17 @@ import pytest
 import photutils_mgauss
 
 PACKAGE = Path(photutils_mgauss.__file__).parent
-TABLE = Path(__file__).parents[1] / 'docs' / 'layers.csv'
+TESTS = Path(__file__).parent
+TABLE = TESTS.parent / 'docs' / 'layers.csv'
+WALK = TABLE.with_name('walk.csv')
 SLOW = ('pymc', 'pytensor', 'arviz', 'matplotlib.pyplot')
 SKY_PACKAGES = ('gwcs', 'astropy.coordinates', 'astropy.time', 'astropy.wcs')
 
 with TABLE.open(newline='') as file:
     LINES = list(csv.DictReader(file))
+with WALK.open(newline='') as file:
+    STATIONS = [(row['Module'].strip('`'), row['Call'].strip('`'))
+                for row in csv.DictReader(file)]
 ROWS = {row['Room']: row for row in LINES}
 FLOORS = {name: int(row['Floor']) for name, row in ROWS.items()}
 # One star in many images: the only module that needs both halves.
@@ -37,6 +45,7 @@ def room_of(name):
     return name.partition('/')[0]
 
 
+@cache
 def parse(name):
     return ast.parse(MODULES[name].read_text(encoding='utf-8'))
 
@@ -135,6 +144,26 @@ def test_no_module_is_long(name):
 @pytest.mark.parametrize('name', MODULES)
 def test_imports_go_downward(name):
     assert upward_imports(name, parse(name)) == []
+
+
+@pytest.mark.parametrize(('name', 'call'), STATIONS)
+def test_the_walk_through_the_house_leads_through_real_doors(name, call):
+    module = import_module(f'photutils_mgauss.{name.replace("/", ".")}')
+    assert attrgetter(call)(module).__module__ == module.__name__
+
+
+def test_tests_stand_in_the_rooms_of_what_they_test():
+    folders = {path.parent.name for path in TESTS.glob('*/test_*.py')}
+    assert folders <= ROWS.keys()
+
+
+@pytest.mark.parametrize('path', [
+    pytest.param(path, id=path.stem) for path in TESTS.rglob('*.py')])
+def test_no_test_module_is_imported(path):
+    names = [name for node in ast.walk(ast.parse(path.read_text('utf-8')))
+             for name in imported_names(node)]
+    assert not [name for name in names if name.startswith('test_')
+                or '.test_' in name]
 
 
 def test_no_two_modules_import_each_other():

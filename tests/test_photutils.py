@@ -24,23 +24,14 @@ from photutils.psf import (
     SourceGrouper,
     make_psf_model_image,
 )
-from psf_grids import make_grid, some_mixture
 
+from helpers.psf_grids import make_grid, some_mixture
+from helpers.star_images import check, draw, narrow_mixture, nearby
 from photutils_mgauss import (
     GaussianMixture,
     GriddedMixturePSF,
     MultiGaussianPSFModel,
 )
-
-
-def narrow_mixture(k):
-    """Return K concentric Gaussians of 1.2 pixels and more."""
-    sizes = 1.2 * 1.5 ** np.arange(k)
-    weights = 0.5 ** np.arange(k)
-    return GaussianMixture.from_stddevs(
-        weights / weights.sum(), np.zeros((k, 2)),
-        np.column_stack([sizes, 1.1 * sizes]), np.full(k, 0.1))
-
 
 MODELS = {
     'K=1': lambda: MultiGaussianPSFModel(narrow_mixture(1)),
@@ -71,36 +62,6 @@ def stars():
     return QTable({'x': [12.3, 35.8, 40.1, 20.2],
                    'y': [14.6, 30.4, 31.9, 44.7],
                    'flux': [3000.0, 5000.0, 2000.0, 800.0]})
-
-
-def draw(psf, stars, shape=(60, 55)):
-    """Draw the stars, each over the whole image."""
-    y, x = np.mgrid[:shape[0], :shape[1]]
-    image = np.zeros(shape)
-    for star in stars:
-        model = psf.copy()
-        model.x_0, model.y_0, model.flux = (star[c]
-                                            for c in ('x', 'y', 'flux'))
-        image += model(x, y)
-    return image
-
-
-def nearby(stars):
-    """Return starting values a little off the stars."""
-    start = stars.copy()
-    start['x'] += 0.2
-    start['y'] -= 0.1
-    start['flux'] *= 0.9
-    return start
-
-
-def check(result, stars, **tolerance):
-    """Compare a result table with the truth."""
-    tolerance = tolerance or {'rtol': 0, 'atol': 2e-4}
-    result.sort('id')
-    assert_allclose(result['x_fit'], stars['x'], **tolerance)
-    assert_allclose(result['y_fit'], stars['y'], **tolerance)
-    assert_allclose(result['flux_fit'], stars['flux'], rtol=1e-3)
 
 
 def test_c1_c2_it_is_a_model_of_x_and_y_with_the_expected_names(psf):

@@ -12,11 +12,11 @@ from astropy.nddata import NDData
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import GriddedPSFModel, PSFPhotometry, SourceGrouper
-from psf_grids import PLACES, epsf_grid, make_grid, some_mixture
-from test_photutils import check, draw, narrow_mixture, nearby
-from test_psf_io import X, Y, write_model
 
 import photutils_mgauss
+from helpers.psf_grids import PLACES, epsf_grid, make_grid, some_mixture
+from helpers.psfex_models import X, Y, write_model
+from helpers.star_images import check, draw, narrow_mixture, nearby
 from photutils_mgauss import (
     GaussianMixture,
     GriddedMixturePSF,

@@ -7,19 +7,12 @@ error.
 """
 import matplotlib.pyplot as plt
 import numpy as np
+from gallery_scenes import star_image
 
-from photutils_mgauss import (
-    CrowdedMixturePhotometry,
-    Instrument,
-    crowded_field,
-    csst_psf,
-    simulate,
-)
+from photutils_mgauss import CrowdedMixturePhotometry, crowded_field
 
-camera = Instrument(shape=(140, 140))
-psf = csst_psf(camera.shape)
-scene = simulate(crowded_field(camera.shape, rng=3), instrument=camera,
-                 psf=psf, rng=2)
+shape = (140, 140)
+psf, scene = star_image(crowded_field(shape, rng=3), shape)
 photometry = CrowdedMixturePhotometry(psf)
 stars = photometry(scene.image, error=scene.error, mask=scene.mask)
 residual = photometry.make_residual_image(

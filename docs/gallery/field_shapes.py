@@ -5,22 +5,18 @@ Size and ellipticity of a mixture field, fitted to the stars of one simulated
 image, minus those of the PSF the stars were drawn with.
 """
 import matplotlib.pyplot as plt
+from gallery_scenes import star_image
 
 from photutils_mgauss import (
-    Instrument,
     assess_psf,
-    csst_psf,
     fit_mixture_field,
     select_psf_stars,
-    simulate,
     sparse_field,
 )
 from photutils_mgauss.plotting import plot_shape_map
 
-camera = Instrument(shape=(700, 700))
-truth = csst_psf(camera.shape)
-scene = simulate(sparse_field(camera.shape, rng=1), instrument=camera,
-                 psf=truth, rng=2)
+shape = (700, 700)
+truth, scene = star_image(sparse_field(shape, rng=1), shape)
 data = scene.image - scene.background
 stars = select_psf_stars(data, error=scene.error, mask=scene.mask)
 field = fit_mixture_field(data, stars, error=scene.error, mask=scene.mask,

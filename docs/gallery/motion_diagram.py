@@ -6,27 +6,15 @@ diagram of their motions, and the measured motions beside the true ones.
 """
 import matplotlib.pyplot as plt
 import numpy as np
+from gallery_scenes import moving_stars
 
-from photutils_mgauss import (
-    Epoch,
-    Instrument,
-    ProperMotionFitter,
-    paper_exposures,
-    simulate_catalogues,
-    sky_field,
-)
+from photutils_mgauss import ProperMotionFitter
 from photutils_mgauss.plotting import plot_comparison, plot_proper_motions
 
-sources = sky_field(200, 100, size=1.2, magnitudes=(19, 23.5), separation=1,
-                    parallaxes=False, rng=1)
-exposures = paper_exposures()
-catalogues = simulate_catalogues(
-    sources, [exposures[i] for i in (0, 1, 3, 5, 6)], rng=2,
-    instrument=Instrument(shape=(1000, 1000)))
+sources, epochs = moving_stars((0, 1, 3, 5, 6))
 quasars = sources['id'][sources['kind'] == 'qso']
 fitter = ProperMotionFitter(references=list(quasars))
-solution = fitter.fit([Epoch(one.table, one.wcs, one.time)
-                       for one in catalogues])
+solution = fitter.fit(epochs)
 
 stars = solution.stars
 figure, axes = plt.subplots(1, 2, figsize=(9.5, 4.4), layout='constrained')

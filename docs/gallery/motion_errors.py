@@ -7,25 +7,15 @@ et al. (as their Fig. 12), and their median for two to seven epochs (as Fig.
 """
 import matplotlib.pyplot as plt
 import numpy as np
+from gallery_scenes import moving_stars
 
-from photutils_mgauss import (
-    Epoch,
-    Instrument,
-    ProperMotionFitter,
-    paper_exposures,
-    simulate_catalogues,
-    sky_field,
-)
+from photutils_mgauss import ProperMotionFitter
 from photutils_mgauss.plotting import (
     plot_errors_by_epochs,
     plot_motion_errors,
 )
 
-sources = sky_field(200, 100, size=1.2, magnitudes=(19, 23.5), separation=1,
-                    parallaxes=False, rng=1)
-catalogues = simulate_catalogues(sources, paper_exposures(), rng=2,
-                                 instrument=Instrument(shape=(1000, 1000)))
-epochs = [Epoch(one.table, one.wcs, one.time) for one in catalogues]
+sources, epochs = moving_stars(range(7))
 quasars = sources['id'][sources['kind'] == 'qso']
 fitter = ProperMotionFitter(references=list(quasars))
 campaigns = ((0, 6), (0, 3, 6), (0, 1, 3, 6), (0, 1, 3, 5, 6),

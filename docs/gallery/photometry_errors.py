@@ -7,27 +7,24 @@ al.).
 """
 import matplotlib.pyplot as plt
 import numpy as np
+from gallery_scenes import star_image
 
 from photutils_mgauss import (
     Instrument,
     MixturePSFPhotometry,
-    csst_psf,
-    simulate,
     sparse_field,
 )
 from photutils_mgauss.plotting import plot_error_curve
 
-camera = Instrument(shape=(1500, 1500))
-psf = csst_psf(camera.shape)
-scene = simulate(sparse_field(camera.shape, rng=1, psf_fraction=0.1,
-                              magnitudes=(18, 24.5)),
-                 instrument=camera, psf=psf, rng=2)
+shape = (1500, 1500)
+psf, scene = star_image(sparse_field(shape, rng=1, psf_fraction=0.1,
+                                     magnitudes=(18, 24.5)), shape)
 stars = scene.truth[scene.truth['inside']]
 table = MixturePSFPhotometry(psf, (11, 11), aperture_radius=3)(
     scene.image - scene.background, error=scene.error, mask=scene.mask,
     init_params=stars['x', 'y', 'flux'])
 
-mas = 1e3 * camera.pixel_scale
+mas = 1e3 * Instrument().pixel_scale
 residuals = mas * np.column_stack([table[f'{c}_fit'] - stars[c].value
                                    for c in 'xy'])
 errors = mas * np.column_stack([table[f'{c}_err'] for c in 'xy'])

@@ -43,6 +43,11 @@ class Field:
         Returns
         -------
         float
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the radius is not a positive number.
         """
         radius = as_real(radius, 'radius', above=0)
         return 1 / self.mixture_at(x, y).encircled_energy(radius)

@@ -2,7 +2,7 @@
 Frames tied to one another: the maps, what fixes them, what leaves them open.
 
 A frame is one epoch's map onto the common plane. Given the stars' reduced
-equations (see ``_joint``) this module finds the maps, says in words which
+equations (see ``joint``) this module finds the maps, says in words which
 combinations of them nothing determines, and judges each detection.
 """
 from dataclasses import dataclass

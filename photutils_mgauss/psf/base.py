@@ -100,7 +100,13 @@ class PSFModel(Fittable2DModel):
         return new
 
     def deepcopy(self):
-        """Return a deep copy of the model."""
+        """
+        Return a deep copy of the model.
+
+        Returns
+        -------
+        model : same class
+        """
         return copy.deepcopy(self)
 
     def __reduce__(self):

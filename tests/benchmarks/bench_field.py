@@ -44,7 +44,7 @@ from photutils_mgauss import (
 )
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from decam_chip import (
+from helpers.decam_chip import (
     decam_chip,
     find_catalogue,
     fit_spline,

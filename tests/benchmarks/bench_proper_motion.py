@@ -21,14 +21,13 @@ from astropy.wcs import WCS
 from scipy.optimize import curve_fit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from motion_scenes import (
+from helpers.motion_scenes import (
     SUBSETS,
     TIMES,
     make_truth,
     observe,
     pulls,
 )
-
 from photutils_mgauss import Epoch, ProperMotionFitter
 from photutils_mgauss.motions.frames import Gauge, solve_frames
 from photutils_mgauss.motions.joint import (

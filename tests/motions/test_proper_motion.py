@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
-from motion_scenes import (
+from numpy.testing import assert_allclose
+
+from helpers.motion_scenes import (
     TIMES,
     changed,
     make_truth,
@@ -16,8 +18,6 @@ from motion_scenes import (
     rms,
     tan_wcs,
 )
-from numpy.testing import assert_allclose
-
 from photutils_mgauss import (
     Epoch,
     ProperMotionFitter,

@@ -14,6 +14,7 @@ from astropy.wcs import WCS as FITSWCS
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import PSFPhotometry
 
+from helpers.small_camera import SMALL, one_star
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.simulation.bound import covariances
@@ -33,14 +34,6 @@ from photutils_mgauss.simulation.scene import (
     sky_field,
     sparse_field,
 )
-
-SMALL = Instrument(shape=(200, 300))
-
-
-def one_star(x, y, flux):
-    return QTable({'x': [x] * u.pix, 'y': [y] * u.pix,
-                   'flux': [flux] * u.electron})
-
 
 # The instrument and the bands.
 

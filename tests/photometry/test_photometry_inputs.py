@@ -9,17 +9,13 @@ from astropy.table import QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import PSFPhotometry
 
+from helpers.star_images import MIXTURE, PSF
 from photutils_mgauss import (
-    GaussianMixture,
     MixtureField,
     MixtureFitter,
     MixturePSFPhotometry,
-    MultiGaussianPSFModel,
 )
 
-MIXTURE = GaussianMixture.from_stddevs(
-    [0.7, 0.3], [[0, 0], [0.1, 0]], [[0.9, 0.85], [1.9, 2.1]], [0.1, 0])
-PSF = MultiGaussianPSFModel(MIXTURE)
 SHAPE = (121, 141)
 
 

@@ -13,8 +13,8 @@ from astropy.io import fits
 from astropy.table import QTable, Table
 from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_array_equal
-from psf_grids import make_grid, some_mixture
 
+from helpers.psf_grids import make_grid, some_mixture
 from photutils_mgauss import (
     GaussianMixture,
     GriddedMixturePSF,
@@ -23,7 +23,7 @@ from photutils_mgauss import (
 )
 from photutils_mgauss.files.asdf_extension import enabled
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def free_model():

@@ -10,10 +10,10 @@ from astropy import coordinates as coord
 from astropy.coordinates import SkyCoord
 from astropy.table import Table
 from astropy.wcs import WCS
-from motion_scenes import TIMES, make_truth, observe, tan_wcs
 from numpy.testing import assert_allclose
-from test_epoch import make_gwcs
 
+from helpers.motion_scenes import TIMES, make_truth, observe
+from helpers.wcs import make_gwcs, tan_wcs
 from photutils_mgauss import (
     Epoch,
     ProperMotionFitter,

@@ -8,18 +8,14 @@ from astropy.table import QTable
 from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
+from helpers.star_images import MIXTURE, PSF
 from photutils_mgauss import (
-    GaussianMixture,
     MixturePSFPhotometry,
-    MultiGaussianPSFModel,
     add_sky_positions,
     cramer_rao,
     fit_many,
 )
 
-MIXTURE = GaussianMixture.from_stddevs(
-    [0.7, 0.3], [[0, 0], [0.1, 0]], [[0.9, 0.85], [1.9, 2.1]], [0.1, 0])
-PSF = MultiGaussianPSFModel(MIXTURE)
 SHAPE = (161, 161)
 SKY = 100.0
 

@@ -4,16 +4,14 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
+from helpers.star_images import MIXTURE
 from photutils_mgauss import (
-    GaussianMixture,
     GriddedMixturePSF,
     MixturePSFPhotometry,
     cramer_rao,
     pixel_error,
 )
 
-MIXTURE = GaussianMixture.from_stddevs(
-    [0.7, 0.3], [[0, 0], [0.1, 0]], [[0.9, 0.85], [1.9, 2.1]], [0.1, 0])
 SKY, READ_NOISE = 30.0, 5.0
 
 

@@ -3,11 +3,14 @@ from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import get_body_barycentric
+from astropy.coordinates import (
+    UnitSphericalRepresentation,
+    get_body_barycentric,
+)
 from astropy.table import Table
 from astropy.time import Time
-from astropy.wcs import WCS
 
+from helpers.wcs import SCALE, tan_wcs
 from photutils_mgauss import Epoch
 
 # Observing times of Table 2 of Nie et al.
@@ -17,22 +20,6 @@ TIMES = Time(['2024-12-12T08:07:10', '2026-05-30T17:27:18',
               '2028-07-21T20:02:14'], scale='tdb')
 SUBSETS = {2: [0, 6], 3: [0, 3, 6], 4: [0, 2, 4, 6], 5: [0, 1, 3, 4, 6],
            6: [0, 1, 2, 3, 4, 6], 7: list(range(7))}
-SCALE = 0.074  # arcsec per pixel
-
-
-def tan_wcs(ra, dec, *, rotation=0.0, mirrored=True, size=9000):
-    """Return a FITS WCS whose middle pixel is at (ra, dec)."""
-    wcs = WCS(naxis=2)
-    wcs.wcs.ctype = 'RA---TAN', 'DEC--TAN'
-    wcs.wcs.crval = ra, dec
-    wcs.wcs.crpix = (size + 1) / 2, (size + 1) / 2
-    c, s = np.cos(np.radians(rotation)), np.sin(np.radians(rotation))
-    matrix = np.array([[c, -s], [s, c]])
-    if mirrored:
-        matrix = np.diag([-1, 1]) @ matrix
-    wcs.wcs.cd = matrix * SCALE / 3600
-    wcs.pixel_shape = size, size
-    return wcs
 
 
 @dataclass(eq=False)
@@ -53,13 +40,11 @@ class Truth:
 
     def at(self, year):
         """Return ra, dec [deg] seen from the Earth, by unit vectors."""
-        a, d = np.radians(self.ra), np.radians(self.dec)
-        zero = np.zeros_like(a)
-        r = np.stack([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a),
-                      np.sin(d)])
-        p = np.stack([-np.sin(a), np.cos(a), zero])
-        q = np.stack([-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a),
-                      np.cos(d)])
+        places = UnitSphericalRepresentation(self.ra * u.deg,
+                                             self.dec * u.deg)
+        axes = places.unit_vectors()
+        r, p, q = (one.to_cartesian().xyz.value
+                   for one in (places, axes['lon'], axes['lat']))
         mas = np.radians(1 / 3.6e6)
         earth = get_body_barycentric('earth', Time(
             year, format='jyear', scale='tdb'), ephemeris='builtin')

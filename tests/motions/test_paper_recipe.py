@@ -1,9 +1,10 @@
 """The recipe of Nie et al., Section 4.2, beside a literal transcription."""
 import numpy as np
 import pytest
-from motion_scenes import SCALE, TIMES, make_truth, observe, pulls, tan_wcs
 from numpy.testing import assert_allclose
 
+from helpers.motion_scenes import TIMES, make_truth, observe, pulls
+from helpers.wcs import SCALE, tan_wcs
 from photutils_mgauss import Epoch, ProperMotionFitter
 
 

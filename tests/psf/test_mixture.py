@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import dblquad, quad
 from scipy.signal import fftconvolve
-from strategies import SETTINGS, covariances, mixtures, numbers
 
+from helpers.strategies import SETTINGS, covariances, mixtures, numbers
 from photutils_mgauss import GaussianMixture, blend
 
 

@@ -7,9 +7,9 @@ import pytest
 from astropy import units as u
 from hypothesis import given, settings
 from numpy.testing import assert_allclose, assert_array_equal
-from psf_grids import make_grid, some_mixture
-from strategies import SETTINGS, numbers
 
+from helpers.psf_grids import make_grid, some_mixture
+from helpers.strategies import SETTINGS, numbers
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF, blend, kernels
 
 Y, X = np.mgrid[:15, :15]

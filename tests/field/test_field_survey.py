@@ -2,9 +2,9 @@
 import numpy as np
 import pytest
 from astropy.table import QTable
-from decam_chip import decam_chip, fit_spline, psfex_spline
 from photutils.psf import PSFPhotometry
 
+from helpers.decam_chip import decam_chip, fit_spline, psfex_spline
 from photutils_mgauss import (
     MixturePSFPhotometry,
     fit_mixture_field,

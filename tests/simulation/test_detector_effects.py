@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import label
-from test_simulation import SMALL, one_star
 
+from helpers.small_camera import SMALL, one_star
 from photutils_mgauss.simulation.effects import bleed, pattern
 from photutils_mgauss.simulation.scene import (
     DetectorEffects,

@@ -2,9 +2,9 @@
 import numpy as np
 import pytest
 from astropy.table import QTable
-from motion_scenes import TIMES, make_truth, observe
 from numpy.testing import assert_allclose
 
+from helpers.motion_scenes import TIMES, make_truth, observe
 from photutils_mgauss import ProperMotionFitter
 
 pytest.importorskip('matplotlib')

@@ -2,9 +2,15 @@
 import numpy as np
 import pytest
 from astropy.table import Table
-from motion_scenes import changed, make_truth, observe, plane_epochs, rms
 from numpy.testing import assert_allclose
 
+from helpers.motion_scenes import (
+    changed,
+    make_truth,
+    observe,
+    plane_epochs,
+    rms,
+)
 from photutils_mgauss import Epoch, ProperMotionFitter, decode_motion_flags
 
 

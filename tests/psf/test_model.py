@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import GaussianPSF
-from strategies import SETTINGS, mixtures, numbers
 
+from helpers.strategies import SETTINGS, mixtures, numbers
 from photutils_mgauss import (
     GaussianMixture,
     GriddedMixturePSF,

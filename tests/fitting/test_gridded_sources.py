@@ -6,15 +6,15 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import EPSFBuilder, EPSFStar, EPSFStars, ImagePSF
-from psf_grids import (
+
+from helpers.psf_grids import (
     PLACES,
     PlainGrid,
     assert_is_truth,
     epsf_grid,
     truth_at,
 )
-from test_psf_io import MODELS, X, Y, write_model
-
+from helpers.psfex_models import MODELS, X, Y, write_model
 from photutils_mgauss import (
     GaussianMixture,
     GriddedMixturePSF,

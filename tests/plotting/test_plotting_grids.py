@@ -2,8 +2,8 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from psf_grids import epsf_grid, make_grid
 
+from helpers.psf_grids import epsf_grid, make_grid
 from photutils_mgauss import (
     GaussianMixture,
     GriddedMixturePSF,

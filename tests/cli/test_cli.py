@@ -21,7 +21,7 @@ from photutils_mgauss.cli import main
 from photutils_mgauss.files.image_layers import read_wcs
 
 # Where this package is imported from, also from another folder.
-SOURCES = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get(
+SOURCES = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get(
     'PYTHONPATH')])]
 COMMANDS = ('psf', 'photometry', 'motions', 'report', 'demo')
 
@@ -94,7 +94,7 @@ def test_the_demonstration_recovers_the_true_motions(demo):
 def chain(tmp_path_factory):
     """Do what README.md says; return the folder with all of it."""
     folder = tmp_path_factory.mktemp('chain')
-    readme = Path(__file__).parents[1] / 'README.md'
+    readme = Path(__file__).parents[2] / 'README.md'
     lines = re.findall(r'^mgauss .*$', readme.read_text(encoding='utf-8'),
                        re.MULTILINE)
     assert [line.split()[1] for line in lines] == [

@@ -1,0 +1,1 @@
+"""Scenes, images, grids and files that several test modules share."""
