@@ -21,7 +21,7 @@ from itertools import pairwise
 import numpy as np
 
 from photutils_mgauss import kernels
-from photutils_mgauss.field.forms import rows_of
+from photutils_mgauss.psf.rows import kernel_rows_of_logs
 from photutils_mgauss.utils.parallel import available_cores
 
 # Standard deviations of the prior on log weight, x, y (of the PSF's width),
@@ -174,7 +174,7 @@ class _PartEquations:
         for first in range(0, len(data), _CHUNK):
             part = slice(first, first + _CHUNK)
             now = self.coefficients, basis[part], local[part]
-            rows = rows_of(*self.form.shapes(*now))
+            rows = kernel_rows_of_logs(*self.form.shapes(*now))
             n = 3 * sources.shape[1] + 6 * rows.shape[1] - 1
             kernels.field_normal(
                 data[part], weights[part], corners[part], basis[part], rows,
@@ -188,8 +188,8 @@ class _PartEquations:
 def model_stamps(problem, coefficients):
     """Draw the fitted stamps, neighbours and sky included, (n, s, s)."""
     out = np.empty_like(problem.stamps.data)
-    rows = rows_of(*problem.form.shapes(coefficients, problem.basis,
-                                        problem.local))
+    rows = kernel_rows_of_logs(*problem.form.shapes(
+        coefficients, problem.basis, problem.local))
     kernels.field_model(problem.stamps.corners, rows, problem.sources,
                         problem.n_sources, problem.sky, out)
     return out

@@ -24,7 +24,7 @@ from photutils_mgauss.fitting.search import (
     refine_astrometry,
     run,
     search,
-    shapes_of,
+    stamp_shapes,
 )
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.parallel import map_chunks
@@ -378,7 +378,7 @@ def _fit_image(problem, spaces, image, weight, start):
         solution = search(stamp, problem, spaces)
     else:
         solution = run(stamp, problem, spaces,
-                       shapes_of(start, problem, stamp.centre))
+                       stamp_shapes(start, problem, stamp.centre))
     if problem.astrometric and solution.has_flux:
         solution = refine_astrometry(stamp, problem, spaces, solution)
     if not solution.has_flux:

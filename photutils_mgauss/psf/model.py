@@ -23,6 +23,7 @@ from photutils_mgauss.psf.base import (
     with_unit,
 )
 from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.psf.rows import kernel_rows_of_stddevs
 from photutils_mgauss.utils.validation import as_integer
 
 __all__ = ['MultiGaussianPSFModel']
@@ -325,11 +326,7 @@ class _Shape:
     @property
     def unit_rows(self):
         """The kernels' rows of Gaussians of unit flux each, (K, 6)."""
-        sx, sy = self.stddevs.T
-        p = 1 / (sx**2 * (1 - self.rho) * (1 + self.rho))
-        q = sy**-2
-        return np.column_stack([np.sqrt(p * q) / (2 * np.pi), self.means, p,
-                                self.rho * sx / sy, q])
+        return kernel_rows_of_stddevs(1.0, self.means, self.stddevs, self.rho)
 
     def weight_slopes(self):
         """Return d weight_j / d fraction_i, (K - 1, K)."""
