@@ -16,8 +16,7 @@ from photutils.psf import PSFPhotometry
 
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
-from photutils_mgauss.simulation.bound import covariances
-from photutils_mgauss.simulation.scene import (
+from photutils_mgauss.simulation import (
     CSST_BANDS,
     Band,
     DetectorEffects,
@@ -33,6 +32,7 @@ from photutils_mgauss.simulation.scene import (
     sky_field,
     sparse_field,
 )
+from photutils_mgauss.simulation.bound import covariances
 
 SMALL = Instrument(shape=(200, 300))
 

@@ -104,7 +104,7 @@ def from_file(path, options):
 
 def from_stars(image, options):
     """Return the grid of an image's own stars, and facts about it."""
-    from photutils_mgauss.field.mixture_field import fit_mixture_field
+    from photutils_mgauss.field.fit import fit_mixture_field
     given = {name: getattr(options, name)
              for name in ('n_components', 'degree', 'radius')}
     fit = {'radius': _RADIUS}

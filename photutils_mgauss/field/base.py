@@ -94,10 +94,8 @@ def residual_stars(fit):
 
 
 def star_table(fit, sample):
-    """Return the table of the stars; note in the sample who was deviant."""
+    """Return the table of the stars that were fitted."""
     problem = fit.problem
-    for star in np.flatnonzero(~problem.used):
-        sample.reasons[sample.exposure[star]][sample.row[star]] = 'deviant'
     n_pixels = (problem.weights > 0).sum(axis=(1, 2))
     table = QTable()
     table['id'] = sample.row + 1

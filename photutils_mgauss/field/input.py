@@ -1,6 +1,6 @@
 """Stars of one or more exposures, as the fit of a field wants them."""
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy.table import QTable, Table
@@ -69,6 +69,13 @@ class Sample:
                        self.sources, self.sources.copy(), hold, self.count,
                        np.zeros(n), bool(local_bkg), np.ones(n, bool),
                        self.exposure, FreeShapes(), np.zeros((n, 3)))
+
+    def without_deviant(self, used):
+        """Return the sample in which the stars not used (n,) are deviant."""
+        reasons = [one.copy() for one in self.reasons]
+        for star in np.flatnonzero(~used):
+            reasons[self.exposure[star]][self.row[star]] = 'deviant'
+        return replace(self, reasons=reasons)
 
     def dropped(self):
         """Return the table of what was not used, and why."""

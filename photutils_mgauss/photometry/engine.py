@@ -14,8 +14,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from photutils_mgauss import kernels
-from photutils_mgauss.psf.gridded import GriddedMixturePSF
-from photutils_mgauss.psf.model import MultiGaussianPSFModel
+from photutils_mgauss.psf.base import PSFModel
 from photutils_mgauss.utils.parallel import map_parallel
 
 CONVERGED = (kernels.CONVERGED, kernels.STALLED)
@@ -72,38 +71,34 @@ def _full_mask(data, mask):
     return np.empty((0, 0), bool) if finite.all() else ~finite
 
 
+def as_model(psf):
+    """Return a PSF as a model; fields are sampled on a grid."""
+    return psf.to_grid() if hasattr(psf, 'to_grid') else psf
+
+
 def psf_arrays(model):
     """
     Return the kernels' form of a PSF model.
 
     Returns
     -------
-    nodes, paces, x_grid, y_grid, integrated : tuple
+    nodes, strides, x_grid, y_grid, integrated : tuple
         The mixtures at the nodes (M, K, 6), what the kernels precompute of
         them (M, K, 4), the axes of the grid, and whether they are integrated
         over pixels.
     """
-    if isinstance(model, GriddedMixturePSF):
-        grid = model._grid
-        rows, x_grid, y_grid = grid.rows, grid.x_grid, grid.y_grid
-    else:
-        rows = model.mixture.rows[None]
-        x_grid = y_grid = np.zeros(1)
+    grid = model.grid
     rows, x_grid, y_grid = (_as_kernels_take(a, np.float64)
-                            for a in (rows, x_grid, y_grid))
-    paces = np.empty((*rows.shape[:2], 4))
-    kernels.strides(rows, paces)
-    return rows, paces, x_grid, y_grid, model.pixel_integrated
+                            for a in (grid.rows, grid.x_grid, grid.y_grid))
+    strides = np.empty((*rows.shape[:2], 4))
+    kernels.strides(rows, strides)
+    return rows, strides, x_grid, y_grid, model.pixel_integrated
 
 
 def is_fixed_shape(model):
     """Return whether the kernels can fit all that is free in a model."""
-    if not isinstance(model, (GriddedMixturePSF, MultiGaussianPSFModel)):
-        return False
-    if isinstance(model, GriddedMixturePSF) and (
-            model.interpolation, model.outside) != ('blend', 'clamp'):
-        return False
-    return all(getattr(model, name).fixed for name in model.param_names[3:])
+    return (isinstance(model, PSFModel) and model.has_fixed_shape
+            and (model.interpolation, model.outside) == ('blend', 'clamp'))
 
 
 def cut_boxes(x, y, fit_shape, data_shape):

@@ -22,6 +22,7 @@ from astropy.table import QTable
 from photutils_mgauss import kernels
 from photutils_mgauss.photometry.engine import (
     Image,
+    as_model,
     cut_boxes,
     is_fixed_shape,
     psf_arrays,
@@ -343,7 +344,7 @@ def _read_image(entry):
         raise ValueError(msg)
     data, psf, wcs = entry
     check_celestial(wcs)
-    psf = psf.to_grid() if hasattr(psf, 'to_grid') else psf
+    psf = as_model(psf)
     if not is_fixed_shape(psf):
         msg = f'images must hold PSFs of fixed shape, got {psf!r:.80}'
         raise TypeError(msg)

@@ -18,7 +18,13 @@ import numpy as np
 from photutils.utils import calc_total_error
 
 from photutils_mgauss import kernels
-from photutils_mgauss.photometry.engine import cut_boxes, psf_arrays
+from photutils_mgauss.photometry.engine import (
+    as_model,
+    cut_boxes,
+    psf_arrays,
+)
+from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.psf.model import MultiGaussianPSFModel
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = ['CramerRao', 'cramer_rao', 'pixel_error']
@@ -248,13 +254,9 @@ class _Jets:
 
 
 def _jet_arrays(psf):
-    from photutils_mgauss.psf.mixture import GaussianMixture
-    from photutils_mgauss.psf.model import MultiGaussianPSFModel
     if isinstance(psf, GaussianMixture):
         psf = MultiGaussianPSFModel(psf)
-    if hasattr(psf, 'to_grid'):
-        psf = psf.to_grid()
-    return psf_arrays(psf)
+    return psf_arrays(as_model(psf))
 
 
 def _bound(jet, flux, noise, free_sky):

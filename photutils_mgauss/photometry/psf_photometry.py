@@ -113,10 +113,9 @@ class MixturePSFPhotometry(PSFPhotometry):
     def __init__(self, psf_model, fit_shape, *, fitter=None, executor=None,
                  fit_sky=False, effective_gain=None, variance='model',
                  xy_cov=False, aperture_radius_correction=None, **kwargs):
-        if hasattr(psf_model, 'to_grid'):
-            psf_model = psf_model.to_grid()
         fitter = MixtureFitter() if fitter is None else fitter
-        super().__init__(psf_model, fit_shape, fitter=fitter, **kwargs)
+        super().__init__(engine.as_model(psf_model), fit_shape, fitter=fitter,
+                         **kwargs)
         self.executor = executor
         self.fit_sky = bool(fit_sky)
         self.effective_gain = (
@@ -404,11 +403,11 @@ def aperture_correction(psf_model, x, y, radius):
 
 def encircled_energy(psf_model, x, y, radius):
     """Return the fraction of a star's flux within a radius, (n,)."""
-    grid = getattr(psf_model, '_grid', None)
-    if grid is None:
-        return np.full(x.shape, psf_model.mixture.encircled_energy(radius))
+    grid = psf_model.grid
     nodes = np.array([grid.node(m).encircled_energy(radius)
                       for m in range(len(grid.scales))])
+    if nodes.size == 1:
+        return np.full(x.shape, nodes[0])
     out = np.empty(x.size)
     for i in range(x.size):
         index, share = grid.neighbours(x[i], y[i])

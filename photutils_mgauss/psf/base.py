@@ -37,6 +37,11 @@ class PSFModel(Fittable2DModel):
 
     Subclasses add `evaluate`, `fit_deriv`, ``_state`` (what is not in
     Parameters, hashable) and ``_half_size`` (of the bounding box).
+
+    Every model is a grid of nodes, and whoever draws or fits stars with one
+    asks for its ``grid``, ``pixel_integrated``, ``interpolation`` and
+    ``outside`` alone. One mixture is a grid of one node, for which it makes
+    no difference how nodes are put together.
     """
 
     flux = PSFParameter(default=1, description='Total flux of the star.')
@@ -47,6 +52,9 @@ class PSFModel(Fittable2DModel):
     # its flux.
     bbox_factor = 5.5
 
+    interpolation = 'blend'
+    outside = 'clamp'
+
     if compat.STALE_GROUP_MODELS:
         __class__ = property(compat.group_class)
 
@@ -56,6 +64,11 @@ class PSFModel(Fittable2DModel):
 
     def _finish(self):
         self._ready = True
+
+    @property
+    def has_fixed_shape(self):
+        """Whether nothing is free but the flux and the position."""
+        return all(getattr(self, name).fixed for name in self.param_names[3:])
 
     @property
     def bounding_box(self):

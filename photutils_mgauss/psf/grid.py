@@ -58,6 +58,12 @@ class Grid:
         for array in self.arrays:
             array.flags.writeable = False
 
+    @classmethod
+    def of_mixture(cls, mixture):
+        """Return the grid of one node."""
+        return cls(np.zeros(1), np.zeros(1), mixture.weights[None],
+                   mixture.means[None], mixture.covariances[None], np.ones(1))
+
     @property
     def arrays(self):
         """The six arrays that make the grid."""

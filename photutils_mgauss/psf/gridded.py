@@ -166,6 +166,11 @@ n_components=1)>
         return self._report.copy()
 
     @property
+    def grid(self):
+        """The mixtures at the nodes as arrays, see `PSFModel`."""
+        return self._grid
+
+    @property
     def grid_xypos(self):
         """The positions (x, y) of the nodes by y, then x, (M, 2) [pix]."""
         return self._grid.positions

@@ -141,9 +141,8 @@ class LocalPSF:
         rows[one, :k] = _merge(weights[one], means[one], covariances[one])
         four = ~merged
         if four.any():
-            rows[four] = kernel_rows(
-                weights[four], means[four], covariances[four]).reshape(
-                    -1, 4 * k, 6)
+            rows[four] = kernel_rows(weights[four], means[four],
+                                     covariances[four]).reshape(-1, 4 * k, 6)
         return rows, count
 
     @staticmethod

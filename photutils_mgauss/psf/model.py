@@ -22,6 +22,7 @@ from photutils_mgauss.psf.base import (
     strip_units,
     with_unit,
 )
+from photutils_mgauss.psf.grid import Grid
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.rows import kernel_rows_of_stddevs
 from photutils_mgauss.utils.validation import as_integer
@@ -152,6 +153,11 @@ class MultiGaussianPSFModel(PSFModel):
         shape = _Shape(self._shape_parameters)
         return GaussianMixture.from_stddevs(shape.weights, shape.means,
                                             shape.stddevs, shape.rho)
+
+    @property
+    def grid(self):
+        """The mixture as a grid of one node, see `PSFModel`."""
+        return Grid.of_mixture(self.mixture)
 
     def free_shape(self):
         """
