@@ -39,7 +39,7 @@ _CHUNK = 256
 
 
 @dataclass
-class Problem:
+class FieldProblem:
     """
     What is fitted, and the present state of the stamps' own numbers.
 

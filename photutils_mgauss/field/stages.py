@@ -10,8 +10,8 @@ import numpy as np
 from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.normal import (
     Equations,
+    FieldProblem,
     Prior,
-    Problem,
     model_stamps,
     optimise,
     to_vector,
@@ -47,7 +47,7 @@ class FieldFit:
 
     Attributes
     ----------
-    problem : Problem
+    problem : FieldProblem
     coefficients : (T, K, 6) `~numpy.ndarray`
     prior : Prior
     equations : Equations
@@ -61,7 +61,7 @@ class FieldFit:
         Their normal equations, if there are several exposures.
     """
 
-    problem: Problem
+    problem: FieldProblem
     coefficients: np.ndarray
     prior: Prior
     equations: Equations

@@ -14,8 +14,8 @@ import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.fitting.search import (
-    Problem,
     Stamp,
+    StampProblem,
     Workspace,
     covariance_of,
     draw_model,
@@ -261,7 +261,7 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
     array([0.8, 0.2])
     """
     images, single = as_stack(image, 'image')
-    problem = Problem(
+    problem = StampProblem(
         n_components=as_integer(n_components, 'n_components', minimum=1),
         oversampling=as_shape(oversampling, 'oversampling'),
         origin=_as_origin(origin, images.shape[1:]),

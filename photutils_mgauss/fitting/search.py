@@ -48,7 +48,7 @@ _LEAST_FINALISTS = 2
 _PREVIEW_TRIAL_STEPS, _PREVIEW_STEPS = 6, 20
 
 
-class Problem(NamedTuple):
+class StampProblem(NamedTuple):
     """What is asked of every image of a stack."""
 
     n_components: int

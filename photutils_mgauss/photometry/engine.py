@@ -26,7 +26,7 @@ _CHUNK = 4000
 
 
 @dataclass(frozen=True, eq=False)
-class Image:
+class KernelImage:
     """
     The pixels of an image, as the kernels take them.
 
@@ -138,7 +138,7 @@ def count_pixels(image, boxes):
 
 
 @dataclass(frozen=True, eq=False)
-class Stars:
+class StarGroups:
     """
     What is to be fitted: n stars, those of a group next to each other.
 
@@ -179,9 +179,10 @@ class Stars:
     def _part(self, first, last):
         starts = self.starts[first:last + 1]
         rows = slice(starts[0], starts[-1])
-        return Stars(self.initial[rows], self.boxes[rows], self.sky[rows],
-                     starts - starts[0], self.lower[rows], self.upper[rows],
-                     self.fixed)
+        return StarGroups(
+            self.initial[rows], self.boxes[rows], self.sky[rows],
+            starts - starts[0], self.lower[rows], self.upper[rows],
+            self.fixed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,10 +250,10 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
 
     Parameters
     ----------
-    image : Image
+    image : KernelImage
     psf : tuple
         See `psf_arrays`.
-    stars : Stars
+    stars : StarGroups
     fit_sky : bool, optional
         Whether to fit a level of the sky to each group, too.
     max_iterations : int, optional

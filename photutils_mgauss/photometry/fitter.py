@@ -121,7 +121,7 @@ class MixtureFitter:
 
     @fitter_unit_support
     def _fit_with_units(self, model, x, y, z, *, weights, maxiter, inplace):
-        problem = _Problem(model, x, y, z, weights)
+        problem = _PixelProblem(model, x, y, z, weights)
         state, status, n_steps = _minimize(problem, maxiter)
         self.fit_info = {
             'param_cov': problem.covariance(state), 'fun': state.residuals,
@@ -173,7 +173,7 @@ class _State:
                       initial=0)
 
 
-class _Problem:
+class _PixelProblem:
     """Weighted residuals and Jacobian as functions of the free parameters."""
 
     def __init__(self, model, x, y, z, weights):

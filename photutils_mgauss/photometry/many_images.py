@@ -21,7 +21,7 @@ from astropy.table import QTable
 
 from photutils_mgauss import kernels
 from photutils_mgauss.photometry.engine import (
-    Image,
+    KernelImage,
     as_model,
     cut_boxes,
     is_fixed_shape,
@@ -338,7 +338,7 @@ class _Images:
 
 
 def _read_image(entry):
-    """Return Image, PSF arrays, WCS and unit of one (data, psf, wcs)."""
+    """Return KernelImage, PSF arrays, WCS and unit of one (data, psf, wcs)."""
     if len(entry) != 3:
         msg = f'images must hold (data, psf, wcs), got {len(entry)} things'
         raise ValueError(msg)
@@ -359,7 +359,8 @@ def _read_image(entry):
     if np.ndim(data) != 2:
         msg = f'images must hold 2-D data, got {np.ndim(data)} dimensions'
         raise ValueError(msg)
-    return Image.from_arrays(data, error, mask), psf_arrays(psf), wcs, unit
+    image = KernelImage.from_arrays(data, error, mask)
+    return image, psf_arrays(psf), wcs, unit
 
 
 def _boxes(xy, fit_shape, data_shape):

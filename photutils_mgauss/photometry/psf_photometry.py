@@ -224,7 +224,7 @@ class MixturePSFPhotometry(PSFPhotometry):
             error = np.sqrt(background
                             + np.maximum(data, 0, dtype=float) / gain)
             gain = None
-        return engine.Image.from_arrays(data, error, mask, gain)
+        return engine.KernelImage.from_arrays(data, error, mask, gain)
 
     def _fit(self, image, init_params):
         """Return the FitResult and the group sizes of all stars."""
@@ -341,9 +341,9 @@ class _Start:
         """Return the stars of the rows, ready to be fitted."""
         # A background that is not finite is not subtracted, only flagged.
         sky = np.where(np.isfinite(self.local_bkg), self.local_bkg, 0.0)
-        return engine.Stars(self.initial[rows], self.boxes[rows],
-                            sky[rows], starts, self.lower[rows],
-                            self.upper[rows], fixed)
+        return engine.StarGroups(
+            self.initial[rows], self.boxes[rows], sky[rows], starts,
+            self.lower[rows], self.upper[rows], fixed)
 
     def result(self, rows, fits):
         """Return the results of all stars, of which rows were fitted."""
