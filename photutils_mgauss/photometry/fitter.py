@@ -22,7 +22,7 @@ from photutils_mgauss.utils.validation import as_integer
 
 __all__ = ['MixtureFitter']
 
-_MESSAGES = {
+MESSAGES = {
     0: 'The fit stopped at its largest number of iterations.',
     2: 'The sum of squares does not get smaller any more.',
     3: 'The next step is expected to be below the tolerance.',
@@ -125,7 +125,7 @@ class MixtureFitter:
         state, status, n_steps = _minimize(problem, maxiter)
         self.fit_info = {
             'param_cov': problem.covariance(state), 'fun': state.residuals,
-            'status': status, 'message': _MESSAGES[status], 'nfev': n_steps}
+            'status': status, 'message': MESSAGES[status], 'nfev': n_steps}
         fitted = model if inplace else model.copy()
         fitted.parameters = problem.full(state.values)
         return fitted

@@ -22,7 +22,6 @@ from photutils.psf import PSFPhotometry
 from photutils_mgauss.photometry import engine
 from photutils_mgauss.photometry import table as _table
 from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
-from photutils_mgauss.photometry.result import FitInfo, FitResult
 from photutils_mgauss.utils import compat
 from photutils_mgauss.utils.validation import as_choice, as_real
 
@@ -255,7 +254,7 @@ class MixturePSFPhotometry(PSFPhotometry):
         columns |= self._extra_columns(result)
         table, rows = _table.assemble(self.init_params, group_size, columns,
                                       compat.results_meta(self))
-        self.fit_info = FitInfo(result, rows)
+        self.fit_info = _table.FitInfo(result, rows)
         return table
 
     def _extra_columns(self, result):
@@ -350,7 +349,7 @@ class _Start:
         full = engine.Fits.empty(len(self.initial))
         for target, source in zip(full.arrays, fits.arrays, strict=True):
             target[rows] = source
-        return FitResult(
+        return _table.FitResult(
             self.initial, self.lower, self.upper, self.local_bkg,
             self.n_pixels, self.reasons, self.valid, self.free,
             self.flagged_bounds, full.values, full.covariances, full.sky,
