@@ -10,6 +10,17 @@ from photutils_mgauss.utils.validation import as_real
 class Field:
     """A PSF that varies over a detector; ``mixture_at`` gives it."""
 
+    def _described(self, details=''):
+        """Return the text of ``repr``; details stand before the degree."""
+        used = int(np.count_nonzero(self.stars['used']))
+        return (f'<{type(self).__name__}({details}degree={self.degree}, '
+                f'shape={self.shape}, {used} of {len(self.stars)} stars)>')
+
+    @property
+    def degree(self):
+        """The degree of the polynomials."""
+        return int(np.sqrt(2 * len(self.coefficients))) - 1
+
     def enclosed_flux(self, x, y):
         """
         Return the share of the PSF's flux inside the fitted circle.

@@ -111,10 +111,7 @@ class MixtureField(Field):
     exposures: QTable = field(default=None)
 
     def __repr__(self):
-        used = int(np.count_nonzero(self.stars['used']))
-        return (f'<MixtureField(n_components={self.n_components}, '
-                f'degree={self.degree}, shape={self.shape}, '
-                f'{used} of {len(self.stars)} stars)>')
+        return self._described(f'n_components={self.n_components}, ')
 
     def _to_tables(self):
         ny, nx = self.shape
@@ -152,11 +149,6 @@ class MixtureField(Field):
     def n_components(self):
         """The number K of Gaussians."""
         return self.coefficients.shape[1]
-
-    @property
-    def degree(self):
-        """The degree of the polynomials."""
-        return int(np.sqrt(2 * len(self.coefficients))) - 1
 
     def mixture_at(self, x, y, *, exposure=None):
         """

@@ -87,14 +87,7 @@ class TunedMixtureField(Field):
     dropped: QTable = field(default=None)
 
     def __repr__(self):
-        used = int(np.count_nonzero(self.stars['used']))
-        return (f'<TunedMixtureField(degree={self.degree}, '
-                f'shape={self.shape}, {used} of {len(self.stars)} stars)>')
-
-    @property
-    def degree(self):
-        """The degree of the polynomials."""
-        return int(np.sqrt(2 * len(self.coefficients))) - 1
+        return self._described()
 
     def changes_at(self, x, y):
         """

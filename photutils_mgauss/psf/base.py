@@ -65,6 +65,18 @@ class PSFModel(Fittable2DModel):
     def _finish(self):
         self._ready = True
 
+    def _described(self, details=''):
+        """Return the text of ``repr``; details stand before the number."""
+        pixel = ', pixel_integrated=True' if self._pixel_integrated else ''
+        return (f'<{type(self).__name__}(flux={self.flux.value:g}, '
+                f'x_0={self.x_0.value:g}, y_0={self.y_0.value:g}, {details}'
+                f'n_components={self.n_components}{pixel})>')
+
+    @property
+    def pixel_integrated(self):
+        """Whether mixtures are integrated over pixels, not sampled."""
+        return self._pixel_integrated
+
     @property
     def has_fixed_shape(self):
         """Whether nothing is free but the flux and the position."""

@@ -196,11 +196,6 @@ n_components=1)>
         return self._grid.weights.shape[1]
 
     @property
-    def pixel_integrated(self):
-        """Whether mixtures are integrated over pixels, not sampled."""
-        return self._pixel_integrated
-
-    @property
     def interpolation(self):
         """How neighbouring nodes are put together."""
         return self._interpolation
@@ -216,11 +211,7 @@ n_components=1)>
                 self._interpolation, self._outside)
 
     def __repr__(self):
-        pixel = ', pixel_integrated=True' if self._pixel_integrated else ''
-        return (f'<GriddedMixturePSF(flux={self.flux.value:g}, '
-                f'x_0={self.x_0.value:g}, y_0={self.y_0.value:g}, '
-                f'grid_shape={self.grid_shape}, '
-                f'n_components={self.n_components}{pixel})>')
+        return self._described(f'grid_shape={self.grid_shape}, ')
 
     def evaluate(self, x, y, flux, x_0, y_0):
         """

@@ -124,19 +124,11 @@ class MultiGaussianPSFModel(PSFModel):
         return self._n_components
 
     @property
-    def pixel_integrated(self):
-        """Whether the mixture is integrated over pixels, not sampled."""
-        return self._pixel_integrated
-
-    @property
     def _state(self):
         return self._n_components, self._pixel_integrated
 
     def __repr__(self):
-        pixel = ', pixel_integrated=True' if self._pixel_integrated else ''
-        return (f'<MultiGaussianPSFModel(flux={self.flux.value:g}, '
-                f'x_0={self.x_0.value:g}, y_0={self.y_0.value:g}, '
-                f'n_components={self._n_components}{pixel})>')
+        return self._described()
 
     @property
     def _shape_parameters(self):
