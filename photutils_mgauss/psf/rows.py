@@ -82,6 +82,8 @@ def _conditioned(covariances):
 
 
 def _rows(weights, means, p, slope, q):
-    amplitude = weights * np.sqrt(p * q) / _TWO_PI
-    return np.stack([amplitude, means[..., 0], means[..., 1], p, slope, q],
-                    axis=-1)
+    rows = np.empty((*p.shape, 6))
+    rows[..., 0] = weights * np.sqrt(p * q) / _TWO_PI
+    rows[..., 1:3] = means
+    rows[..., 3], rows[..., 4], rows[..., 5] = p, slope, q
+    return rows
