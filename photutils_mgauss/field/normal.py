@@ -31,6 +31,12 @@ from photutils_mgauss.utils.parallel import available_cores
 # wander, and with them the centroid.
 _PRIOR_CONSTANT = np.array([0.8, 0.4, 0.4, 0.3, 0.3, 0.3])
 _PRIOR_VARIATION = np.array([0.15, 0.1, 0.1, 0.07, 0.07, 0.07])
+# Standard deviations of the prior on changes of a known PSF: of covariances,
+# of log weights, of means, in powers of the PSF's width; and the share of
+# them that varies over the field.
+_PRIOR_CHANGE = np.array([1.0, 1.0, 1.0, 0.5, 0.3, 0.3])
+_PRIOR_CHANGE_POWER = np.array([2, 2, 2, 0, 1, 1])
+_PRIOR_CHANGE_VARIATION = 0.3
 
 # Gauss-Newton steps of the stamps' own numbers for each step of the shapes.
 _SETTLE_STEPS = 2
@@ -218,6 +224,14 @@ class Prior:
         stddev = np.tile(_PRIOR_VARIATION * scale, (n_terms, len(shapes), 1))
         stddev[0] = _PRIOR_CONSTANT * scale
         return cls(mean, strength / stddev**2, strength)
+
+    @classmethod
+    def of_changes(cls, n_terms, width, strength=1.0):
+        """Return the prior of changes of a known PSF, about none."""
+        stddev = np.tile(_PRIOR_CHANGE * width**_PRIOR_CHANGE_POWER,
+                         (n_terms, 1))
+        stddev[1:] *= _PRIOR_CHANGE_VARIATION
+        return cls(np.zeros((n_terms, 6)), strength / stddev**2, strength)
 
     def first(self, n_terms):
         """Return the prior of the first terms."""

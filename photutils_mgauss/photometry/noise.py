@@ -84,14 +84,8 @@ def pixel_error(light, *, sky=0, read_noise=0, gain=1, exposure_time=None):
         of it. Errors from the image are too small where noise made a pixel
         faint, and weighted fluxes come out low; with a model they do not.
         Negative light counts as none.
-    sky : float or (ny, nx) array_like, optional
-        The level of the sky, in the unit of the image.
-    read_noise : float, optional
-        The noise of the readout [electron].
-    gain : float, optional
-        Electrons in a count; 1 for images in electrons.
-    exposure_time : float, optional
-        If given, the image is a rate and this is its exposure time [s].
+    sky, read_noise, gain, exposure_time : optional
+        As for `background_error`; ``sky`` may be an image.
 
     Returns
     -------
@@ -184,12 +178,8 @@ def cramer_rao(psf, flux, sky=0, *, x=0, y=0, read_noise=0, gain=1,
         The level of the sky, in the unit of the image.
     x, y : (n,) array_like, optional
         The positions [pix].
-    read_noise : float, optional
-        The noise of the readout [electron].
-    gain : float, optional
-        Electrons in a count; 1 for images in electrons.
-    exposure_time : float, optional
-        If given, the image is a rate and this is its exposure time [s].
+    read_noise, gain, exposure_time : float, optional
+        As for `background_error`.
     fit_shape : int or (ny, nx) tuple of int, optional
         The pixels used of each star.
     free_sky : bool, optional

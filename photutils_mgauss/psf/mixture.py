@@ -215,10 +215,8 @@ class GaussianMixture:
 
         Parameters
         ----------
-        x, y : array_like
-            Positions relative to the star [pix]; they broadcast.
-        pixel_integrated : bool, optional
-            Whether to differentiate the integral over the unit pixel.
+        x, y, pixel_integrated
+            As for `evaluate`; what is differentiated is what it returns.
 
         Returns
         -------
