@@ -14,8 +14,7 @@ def add(commands):
         'image from its own\nstars, measure all stars, align the epochs on '
         'quasars, fit proper motions, and\ncompare them with the truth.',
         'mgauss demo --epochs 3 --output my_demo', run)
-    demo.add_argument('--output', default='mgauss_demo', metavar='FOLDER',
-                      help='where files go (default: %(default)s)')
+    tools.add_folder(demo, 'mgauss_demo')
     demo.add_argument('--epochs', type=int, choices=range(2, 8), default=5,
                       help='number of epochs (default: %(default)s)')
     demo.add_argument('--size', type=tools.count, default=1024,
@@ -27,7 +26,7 @@ def add(commands):
                       help='write the images, as FITS, and the quasars, and '
                            'measure nothing: something to try the other '
                            'commands on')
-    tools.add_manners(demo)
+    tools.add_common(demo)
 
 
 def run(options):

@@ -22,11 +22,9 @@ def add(commands):
         'motions are relative to the mean of the stars.',
         'mgauss motions night1_cat.ecsv night2_cat.ecsv '
         '--references quasars.ecsv', run)
-    parser.add_argument('inputs', nargs='+', metavar='FILE',
-                        help='a catalogue or an image of each exposure')
-    parser.add_argument('--output', default='mgauss_motions',
-                        metavar='FOLDER',
-                        help='where files go (default: %(default)s)')
+    tools.add_inputs(parser, 'FILE', 'a catalogue or an image of each '
+                                     'exposure')
+    tools.add_folder(parser, 'mgauss_motions')
     parser.add_argument('--format', choices=('ecsv', 'fits'), default='ecsv',
                         help='of the tables (default: %(default)s)')
     _add_solution(parser)
@@ -34,7 +32,7 @@ def add(commands):
     psf_command.add_fit(parser)
     photometry.add_measuring(parser)
     tools.add_reading(parser)
-    tools.add_manners(parser)
+    tools.add_common(parser)
     parser.set_defaults(grid_shape=[30, 30])
 
 

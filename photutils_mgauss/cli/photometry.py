@@ -19,7 +19,7 @@ def add(commands):
         "The catalogue has\nphotutils' columns and, if the image has a WCS, "
         'places on the sky with covariances.',
         'mgauss photometry night1.fits --psf night1_psf.fits', run)
-    parser.add_argument('inputs', nargs='+', metavar='IMAGE', help='images')
+    tools.add_inputs(parser, 'IMAGE', 'images')
     parser.add_argument('--psf', nargs='+', required=True, metavar='FILE',
                         help='PSF of all images, or one for each: a file of '
                              'mgauss psf, or any it could read')
@@ -29,7 +29,7 @@ def add(commands):
     add_measuring(parser)
     tools.add_times(parser)
     tools.add_reading(parser)
-    tools.add_manners(parser)
+    tools.add_common(parser)
 
 
 def add_measuring(parser):

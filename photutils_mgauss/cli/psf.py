@@ -15,8 +15,7 @@ def add(commands):
         'and STPSF grids and ePSFs (images\nwith the keyword OVERSAMP) are '
         'fitted.', 'mgauss psf night1.fits night2.fits --output psfs',
         run)
-    parser.add_argument('inputs', nargs='+', metavar='FILE',
-                        help='images or PSF files')
+    tools.add_inputs(parser, 'FILE', 'images or PSF files')
     parser.add_argument('--output', metavar='NAME',
                         help='folder, or for a single input a file: .fits or '
                              '.asdf (default: INPUT_psf.fits)')
@@ -26,7 +25,7 @@ def add(commands):
     add_fit(parser)
     _add_files(parser)
     tools.add_reading(parser)
-    tools.add_manners(parser)
+    tools.add_common(parser)
 
 
 def add_fit(parser):
@@ -104,7 +103,7 @@ def from_file(path, options):
 
 def from_stars(image, options):
     """Return the grid of an image's own stars, and facts about it."""
-    from photutils_mgauss.field.mixture_field import fit_mixture_field
+    from photutils_mgauss.field.fit import fit_mixture_field
     given = {name: getattr(options, name)
              for name in ('n_components', 'degree', 'radius')}
     fit = {'radius': _RADIUS}

@@ -13,13 +13,13 @@ def add(commands):
         'has its figures\ninside and needs no other file.',
         'mgauss report night1_psf.fits night1_cat.ecsv mgauss_motions '
         '--output report.html', run)
-    parser.add_argument('inputs', nargs='+', metavar='PATH',
-                        help='results of other commands, or folders of them')
+    tools.add_inputs(parser, 'PATH',
+                     'results of other commands, or folders of them')
     parser.add_argument('--output', default='mgauss_report.html',
                         metavar='FILE', help='default: %(default)s')
     parser.add_argument('--title', default='Positions and proper motions',
                         help='of the page (default: %(default)s)')
-    tools.add_manners(parser)
+    tools.add_common(parser)
 
 
 def run(options):

@@ -70,18 +70,29 @@ def catalogue_section(path, table, record):
     """Return the section on a catalogue of one image."""
     good = np.asarray(table['flags']) == 0 if 'flags' in table.colnames else (
         np.ones(len(table), bool))
+    facts = _star_facts(table, good) | _when(record)
+    return Section(f'Catalogue: {path}', facts=facts,
+                   panels=tuple(_star_panels(table, good)), record=record)
+
+
+def _star_facts(table, good):
+    """Return the numbers about a catalogue's stars."""
+    flux, error = _plain(table, 'flux_fit'), _plain(table, 'x_err')
+    bright = flux >= np.nanpercentile(flux[good], 90) if good.any() else good
+    return {'Stars': len(table), 'Without flags': int(good.sum()),
+            'Median error of x [pix]': f'{np.nanmedian(error[good]):.4f}',
+            'That of the brightest tenth [pix]':
+                f'{np.nanmedian(error[bright & good]):.4f}'}
+
+
+def _star_panels(table, good):
+    """Return the figures of a catalogue's stars."""
     flux = _plain(table, 'flux_fit')
     unit = getattr(table['flux_fit'], 'unit', None)
     with np.errstate(invalid='ignore', divide='ignore'):
         magnitude = -2.5 * np.log10(flux)
     label = f'-2.5 log flux{"" if unit is None else f" / ({unit})"} [mag]'
     errors = {name: _plain(table, name)[good] for name in ('x_err', 'y_err')}
-    bright = flux >= np.nanpercentile(flux[good], 90) if good.any() else good
-    facts = {'Stars': len(table), 'Without flags': int(good.sum()),
-             'Median error of x [pix]': f'{np.nanmedian(errors["x_err"]):.4f}',
-             'That of the brightest tenth [pix]':
-                 f'{np.nanmedian(_plain(table, "x_err")[bright & good]):.4f}'}
-    facts |= _when(record)
     x, y = _plain(table, 'x_fit'), _plain(table, 'y_fit')
     panels = [
         Panel(lambda ax: plotting.plot_detections(ax, x, y, flux),
@@ -95,8 +106,7 @@ def catalogue_section(path, table, record):
             lambda ax: _chi2(ax, magnitude[good], chi2, label),
             'How well the PSF describes the stars: 1 if noise is all that '
             'is left.'))
-    return Section(f'Catalogue: {path}', facts=facts, panels=tuple(panels),
-                   record=record)
+    return panels
 
 
 def _chi2(ax, magnitude, chi2, label):

@@ -61,7 +61,18 @@ def command(commands, name, words, description, example, run):
     return parser
 
 
-def add_manners(parser):
+def add_inputs(parser, metavar, words):
+    """Add the files or folders that a command reads."""
+    parser.add_argument('inputs', nargs='+', metavar=metavar, help=words)
+
+
+def add_folder(parser, default):
+    """Add the option for the folder that a command writes into."""
+    parser.add_argument('--output', default=default, metavar='FOLDER',
+                        help='where files go (default: %(default)s)')
+
+
+def add_common(parser):
     """Add the options that every command has."""
     parser.add_argument('--overwrite', action='store_true',
                         help='replace files of an earlier run')

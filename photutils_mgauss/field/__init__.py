@@ -13,7 +13,7 @@ from photutils_mgauss.utils.lazy import hand_on
 
 __getattr__, __dir__, __all__ = hand_on(__name__, {
     'EmpiricalPSF': 'empirical',
-    'fit_mixture_field': 'mixture_field',
+    'fit_mixture_field': 'fit',
     'MixtureField': 'mixture_field',
     'select_psf_stars': 'selection',
     'TunedMixtureField': 'tuned_field',

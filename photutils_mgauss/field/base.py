@@ -10,6 +10,17 @@ from photutils_mgauss.utils.validation import as_real
 class Field:
     """A PSF that varies over a detector; ``mixture_at`` gives it."""
 
+    def _described(self, details=''):
+        """Return the text of ``repr``; details stand before the degree."""
+        used = int(np.count_nonzero(self.stars['used']))
+        return (f'<{type(self).__name__}({details}degree={self.degree}, '
+                f'shape={self.shape}, {used} of {len(self.stars)} stars)>')
+
+    @property
+    def degree(self):
+        """The degree of the polynomials."""
+        return int(np.sqrt(2 * len(self.coefficients))) - 1
+
     def enclosed_flux(self, x, y):
         """
         Return the share of the PSF's flux inside the fitted circle.
@@ -99,10 +110,8 @@ def residual_stars(fit):
 
 
 def star_table(fit, sample):
-    """Return the table of the stars; note in the sample who was deviant."""
+    """Return the table of the stars that were fitted."""
     problem = fit.problem
-    for star in np.flatnonzero(~problem.used):
-        sample.reasons[sample.exposure[star]][sample.row[star]] = 'deviant'
     n_pixels = (problem.weights > 0).sum(axis=(1, 2))
     table = QTable()
     table['id'] = sample.row + 1

@@ -18,7 +18,7 @@ def choose(problem, n_components, degree, max_degree, strength, workers):
 
     Parameters
     ----------
-    problem : Problem
+    problem : FieldProblem
         With the terms of ``max_degree`` in its basis.
     n_components, degree : int or 'auto'
     max_degree : int

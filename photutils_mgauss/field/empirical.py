@@ -21,11 +21,9 @@ from scipy.sparse.linalg import LinearOperator, lsqr
 
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import lattice
+from photutils_mgauss.field.fit import fit_mixture_field
 from photutils_mgauss.field.input import normalised, read_sample
-from photutils_mgauss.field.mixture_field import (
-    MixtureField,
-    fit_mixture_field,
-)
+from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 __all__ = ['EmpiricalPSF']

@@ -2,38 +2,17 @@ r"""
 What the PSF of each star is made of.
 
 Each form turns numbers that are polynomials of detector position into the
-shapes of K Gaussians at n stars. Shapes (n, K, 6) are log weight, mean x and
-y, and the factors :math:`\tfrac12\ln p, s, \tfrac12\ln q` of the precision
-matrix, so that any values are a valid mixture.
+shapes of K Gaussians at n stars. Shapes (n, K, 6) are the log rows of
+`photutils_mgauss.psf.rows`, so that any values are a valid mixture.
 """
 from dataclasses import dataclass
 
 import numpy as np
 
-_TWO_PI = 2 * np.pi
+from photutils_mgauss.psf.rows import covariances_of_logs
+
 # Steps of numerical derivatives.
 _STEP = 1e-5
-
-
-def rows_of(shapes, sign=1.0):
-    """Return the rows (n, K, 6) that kernels take."""
-    rows = np.array(shapes)
-    log_weight, log_p, log_q = (shapes[..., i] for i in (0, 3, 5))
-    rows[..., 0] = sign * np.exp(log_weight + log_p + log_q) / _TWO_PI
-    rows[..., 3], rows[..., 5] = np.exp(2 * log_p), np.exp(2 * log_q)
-    return rows
-
-
-def shapes_of(mixture):
-    """Return the shapes (K, 6) of a mixture, and the signs of its weights."""
-    covariance = mixture.covariances
-    syy = covariance[:, 1, 1]
-    s = covariance[:, 0, 1] / syy
-    rest = covariance[:, 0, 0] - s * covariance[:, 0, 1]
-    shapes = np.column_stack([
-        np.log(np.abs(mixture.weights)), mixture.means, -0.5 * np.log(rest),
-        s, -0.5 * np.log(syy)])
-    return shapes, np.sign(mixture.weights)
 
 
 def mixture_arrays(shapes):
@@ -43,18 +22,7 @@ def mixture_arrays(shapes):
     weights /= weights.sum(axis=-1, keepdims=True)
     shift = np.einsum('nk,nki->ni', weights, shapes[..., 1:3])
     means = shapes[..., 1:3] - shift[:, None]
-    return weights, means, covariances_of(shapes), shift
-
-
-def covariances_of(shapes):
-    """Return the covariance matrices (..., 2, 2) of shapes (..., 6)."""
-    s = shapes[..., 4]
-    syy = np.exp(-2 * shapes[..., 5])
-    covariances = np.empty((*s.shape, 2, 2))
-    covariances[..., 0, 0] = np.exp(-2 * shapes[..., 3]) + s**2 * syy
-    covariances[..., 0, 1] = covariances[..., 1, 0] = s * syy
-    covariances[..., 1, 1] = syy
-    return covariances
+    return weights, means, covariances_of_logs(shapes), shift
 
 
 def convolved(shapes, blur):

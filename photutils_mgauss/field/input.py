@@ -1,6 +1,6 @@
 """Stars of one or more exposures, as the fit of a field wants them."""
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy.table import QTable, Table
@@ -9,7 +9,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.choice import DEGREES
 from photutils_mgauss.field.forms import FreeShapes
-from photutils_mgauss.field.normal import Problem
+from photutils_mgauss.field.normal import FieldProblem
 from photutils_mgauss.field.stamps import Stamps, cut_stamps, remove_star_noise
 from photutils_mgauss.utils.star_columns import read_sources
 from photutils_mgauss.utils.validation import as_image
@@ -65,10 +65,18 @@ class Sample:
         hold = np.full(self.sources.shape, _NEIGHBOUR_STDDEV**-2.0)
         hold[..., 2] = 1 / np.maximum(self.sources[..., 2] ** 2, 1e-300)
         n = len(x)
-        return Problem(self.stamps, np.zeros(self.stamps.data.shape), basis,
-                       self.sources, self.sources.copy(), hold, self.count,
-                       np.zeros(n), bool(local_bkg), np.ones(n, bool),
-                       self.exposure, FreeShapes(), np.zeros((n, 3)))
+        return FieldProblem(
+            self.stamps, np.zeros(self.stamps.data.shape), basis, self.sources,
+            self.sources.copy(), hold, self.count, np.zeros(n),
+            bool(local_bkg), np.ones(n, bool), self.exposure, FreeShapes(),
+            np.zeros((n, 3)))
+
+    def without_deviant(self, used):
+        """Return the sample in which the stars not used (n,) are deviant."""
+        reasons = [one.copy() for one in self.reasons]
+        for star in np.flatnonzero(~used):
+            reasons[self.exposure[star]][self.row[star]] = 'deviant'
+        return replace(self, reasons=reasons)
 
     def dropped(self):
         """Return the table of what was not used, and why."""

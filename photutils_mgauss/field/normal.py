@@ -21,7 +21,7 @@ from itertools import pairwise
 import numpy as np
 
 from photutils_mgauss import kernels
-from photutils_mgauss.field.forms import rows_of
+from photutils_mgauss.psf.rows import kernel_rows_of_logs
 from photutils_mgauss.utils.parallel import available_cores
 
 # Standard deviations of the prior on log weight, x, y (of the PSF's width),
@@ -31,6 +31,12 @@ from photutils_mgauss.utils.parallel import available_cores
 # wander, and with them the centroid.
 _PRIOR_CONSTANT = np.array([0.8, 0.4, 0.4, 0.3, 0.3, 0.3])
 _PRIOR_VARIATION = np.array([0.15, 0.1, 0.1, 0.07, 0.07, 0.07])
+# Standard deviations of the prior on changes of a known PSF: of covariances,
+# of log weights, of means, in powers of the PSF's width; and the share of
+# them that varies over the field.
+_PRIOR_CHANGE = np.array([1.0, 1.0, 1.0, 0.5, 0.3, 0.3])
+_PRIOR_CHANGE_POWER = np.array([2, 2, 2, 0, 1, 1])
+_PRIOR_CHANGE_VARIATION = 0.3
 
 # Gauss-Newton steps of the stamps' own numbers for each step of the shapes.
 _SETTLE_STEPS = 2
@@ -39,7 +45,7 @@ _CHUNK = 256
 
 
 @dataclass
-class Problem:
+class FieldProblem:
     """
     What is fitted, and the present state of the stamps' own numbers.
 
@@ -174,7 +180,7 @@ class _PartEquations:
         for first in range(0, len(data), _CHUNK):
             part = slice(first, first + _CHUNK)
             now = self.coefficients, basis[part], local[part]
-            rows = rows_of(*self.form.shapes(*now))
+            rows = kernel_rows_of_logs(*self.form.shapes(*now))
             n = 3 * sources.shape[1] + 6 * rows.shape[1] - 1
             kernels.field_normal(
                 data[part], weights[part], corners[part], basis[part], rows,
@@ -188,8 +194,8 @@ class _PartEquations:
 def model_stamps(problem, coefficients):
     """Draw the fitted stamps, neighbours and sky included, (n, s, s)."""
     out = np.empty_like(problem.stamps.data)
-    rows = rows_of(*problem.form.shapes(coefficients, problem.basis,
-                                        problem.local))
+    rows = kernel_rows_of_logs(*problem.form.shapes(
+        coefficients, problem.basis, problem.local))
     kernels.field_model(problem.stamps.corners, rows, problem.sources,
                         problem.n_sources, problem.sky, out)
     return out
@@ -218,6 +224,14 @@ class Prior:
         stddev = np.tile(_PRIOR_VARIATION * scale, (n_terms, len(shapes), 1))
         stddev[0] = _PRIOR_CONSTANT * scale
         return cls(mean, strength / stddev**2, strength)
+
+    @classmethod
+    def of_changes(cls, n_terms, width, strength=1.0):
+        """Return the prior of changes of a known PSF, about none."""
+        stddev = np.tile(_PRIOR_CHANGE * width**_PRIOR_CHANGE_POWER,
+                         (n_terms, 1))
+        stddev[1:] *= _PRIOR_CHANGE_VARIATION
+        return cls(np.zeros((n_terms, 6)), strength / stddev**2, strength)
 
     def first(self, n_terms):
         """Return the prior of the first terms."""

@@ -10,8 +10,8 @@ import numpy as np
 from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.normal import (
     Equations,
+    FieldProblem,
     Prior,
-    Problem,
     model_stamps,
     optimise,
     to_vector,
@@ -30,12 +30,6 @@ _STAR_EXCESS = 0.3
 _MAX_DEVIANT_PIXELS = 0.1
 # How often the prior takes the widths of the coefficients found under it.
 _ADAPTATIONS = 3
-# Standard deviations of the prior on changes of a known PSF: of covariances,
-# of log weights, of means, in powers of the PSF's width; and the share of
-# them that varies over the field.
-_PRIOR_CHANGE = np.array([1.0, 1.0, 1.0, 0.5, 0.3, 0.3])
-_PRIOR_CHANGE_POWER = np.array([2, 2, 2, 0, 1, 1])
-_PRIOR_CHANGE_VARIATION = 0.3
 # Relative error of the PSF assumed before anything is known of it.
 _FIRST_ACCURACY = 0.1
 
@@ -47,7 +41,7 @@ class FieldFit:
 
     Attributes
     ----------
-    problem : Problem
+    problem : FieldProblem
     coefficients : (T, K, 6) `~numpy.ndarray`
     prior : Prior
     equations : Equations
@@ -61,7 +55,7 @@ class FieldFit:
         Their normal equations, if there are several exposures.
     """
 
-    problem: Problem
+    problem: FieldProblem
     coefficients: np.ndarray
     prior: Prior
     equations: Equations
@@ -341,14 +335,8 @@ def tune(problem, degree, workers, *, strength=1.0, reject=True):
 
     ``problem.local`` holds the known PSF. Returns a `FieldFit`.
     """
-    terms = n_terms(degree)
-    stddev = np.tile(_PRIOR_CHANGE
-                     * first_width(problem) ** _PRIOR_CHANGE_POWER,
-                     (terms, 1))
-    stddev[1:] *= _PRIOR_CHANGE_VARIATION
-    start = np.zeros((terms, 6))
-    prior = Prior(start, strength / stddev**2, strength)
-    state = FieldFit(problem, start, prior, None, _FIRST_ACCURACY,
+    prior = Prior.of_changes(n_terms(degree), first_width(problem), strength)
+    state = FieldFit(problem, prior.mean, prior, None, _FIRST_ACCURACY,
                      np.zeros(problem.stamps.good.shape, bool))
     return _finish(state, degree, workers, reject)
 

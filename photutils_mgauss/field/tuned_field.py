@@ -21,10 +21,11 @@ from astropy.table import QTable
 
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import Field, lattice
-from photutils_mgauss.field.forms import TunedShapes, covariances_of, shapes_of
+from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.input import normalised
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.psf.rows import covariances_of_logs, log_rows
 from photutils_mgauss.utils.validation import as_real, as_shape
 
 __all__ = ['TunedMixtureField']
@@ -86,14 +87,7 @@ class TunedMixtureField(Field):
     dropped: QTable = field(default=None)
 
     def __repr__(self):
-        used = int(np.count_nonzero(self.stars['used']))
-        return (f'<TunedMixtureField(degree={self.degree}, '
-                f'shape={self.shape}, {used} of {len(self.stars)} stars)>')
-
-    @property
-    def degree(self):
-        """The degree of the polynomials."""
-        return int(np.sqrt(2 * len(self.coefficients))) - 1
+        return self._described()
 
     def changes_at(self, x, y):
         """
@@ -152,7 +146,8 @@ class TunedMixtureField(Field):
             self.coefficients, self._basis(x, y),
             known_shapes(self.start, [x], [y]))
         return GaussianMixture(sign[0] * np.exp(shapes[0, :, 0]),
-                               shapes[0, :, 1:3], covariances_of(shapes[0]))
+                               shapes[0, :, 1:3],
+                               covariances_of_logs(shapes[0]))
 
     def to_grid(self, grid_shape=None):
         """
@@ -192,17 +187,17 @@ def known_shapes(start, x, y):
     """
     pixel = (_PIXEL_VARIANCE * np.eye(2)
              if getattr(start, 'pixel_integrated', False) else None)
-    found = []
-    for place in zip(x, y, strict=True):
-        mixture = start.mixture_at(*place)
-        found.append(shapes_of(mixture if pixel is None
-                               else mixture.convolve(pixel)))
-    most = max(len(sign) for _, sign in found)
-    shapes, signs = np.zeros((len(found), most, 6)), np.ones((len(found),
-                                                              most))
-    for i, (one, sign) in enumerate(found):
-        n = len(sign)
-        shapes[i], signs[i, :n] = one[np.argmax(one[:, 0])], sign
+    found = [start.mixture_at(*place) for place in zip(x, y, strict=True)]
+    if pixel is not None:
+        found = [mixture.convolve(pixel) for mixture in found]
+    most = max(mixture.n_components for mixture in found)
+    shapes, signs = (np.zeros((len(found), most, 6)),
+                     np.ones((len(found), most)))
+    for i, mixture in enumerate(found):
+        one = log_rows(mixture.weights, mixture.means, mixture.covariances)
+        n = len(one)
+        shapes[i], signs[i, :n] = (one[np.argmax(one[:, 0])],
+                                   np.sign(mixture.weights))
         # Not exactly 0, which has no logarithm.
         shapes[i, n:, 0] = -690
         shapes[i, :n] = one

@@ -18,6 +18,11 @@ _COUNTED = {'e': u.electron, 'e-': u.electron, 'electron': u.electron,
 _RATE = re.compile(r'(.+?)(?:/s(?:ec)?|\*?\*?s(?:\^|\*\*)?-1)')
 
 
+def _positive(keys, words):
+    """Return a property of `Cards`: the first number, if positive."""
+    return property(lambda cards: cards.positive(*keys), doc=words)
+
+
 class Cards:
     """
     The headers that hold for an image, the most special one first.
@@ -50,25 +55,12 @@ class Cards:
                 return float(value)
         return None
 
-    @property
-    def gain(self):
-        """Electrons in a count."""
-        return self.positive(*_GAIN)
-
-    @property
-    def read_noise(self):
-        """The noise of the readout [electron]."""
-        return self.positive(*_READ_NOISE)
-
-    @property
-    def exposure_time(self):
-        """The exposure time [s]."""
-        return self.positive(*_EXPOSURE_TIME)
-
-    @property
-    def saturation(self):
-        """The level from which pixels are saturated, in the image's unit."""
-        return self.positive(*_SATURATION)
+    gain = _positive(_GAIN, 'Electrons in a count.')
+    read_noise = _positive(_READ_NOISE, 'The noise of the readout [electron].')
+    exposure_time = _positive(_EXPOSURE_TIME, 'The exposure time [s].')
+    saturation = _positive(
+        _SATURATION, 'The level from which pixels are saturated, in the '
+        "image's unit.")
 
     def positive(self, *keys):
         """Return the first number if it is positive, else None."""

@@ -13,22 +13,23 @@ from photutils_mgauss.psf.gridded import GriddedMixturePSF
 
 def fit_gridded_psf(psf, n_components, **kwargs):
     """See `GriddedMixturePSF.from_gridded_psf`."""
-    return _fitted(of_gridded_psf(psf), n_components, **kwargs)
+    return fit_node_images(of_gridded_psf(psf), n_components, **kwargs)
 
 
 def fit_psfex(path, n_components, *, grid_shape, limits, contexts, **kwargs):
     """See `GriddedMixturePSF.from_psfex`."""
     nodes = of_psfex(path, grid_shape, limits=limits, contexts=contexts)
-    return _fitted(nodes, n_components, scaled=False, **kwargs)
+    return fit_node_images(nodes, n_components, scaled=False, **kwargs)
 
 
 def fit_image_psf(psf, n_components, *, grid_xypos, **kwargs):
     """See `GriddedMixturePSF.from_image_psf`."""
-    return _fitted(of_image_psf(psf, grid_xypos), n_components, **kwargs)
+    nodes = of_image_psf(psf, grid_xypos)
+    return fit_node_images(nodes, n_components, **kwargs)
 
 
-def _fitted(nodes, n_components, *, scaled=True, interpolation='blend',
-            outside='clamp', **kwargs):
+def fit_node_images(nodes, n_components, *, scaled=True,
+                    interpolation='blend', outside='clamp', **kwargs):
     """Fit images and return the grid with the report of the fits."""
     mixtures, scales, report = fit_nodes(nodes, n_components, **kwargs)
     if not any(mixtures):

@@ -14,8 +14,8 @@ import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.fitting.search import (
-    Problem,
     Stamp,
+    StampProblem,
     Workspace,
     covariance_of,
     draw_model,
@@ -24,7 +24,7 @@ from photutils_mgauss.fitting.search import (
     refine_astrometry,
     run,
     search,
-    shapes_of,
+    stamp_shapes,
 )
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.parallel import map_chunks
@@ -261,7 +261,7 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
     array([0.8, 0.2])
     """
     images, single = as_stack(image, 'image')
-    problem = Problem(
+    problem = StampProblem(
         n_components=as_integer(n_components, 'n_components', minimum=1),
         oversampling=as_shape(oversampling, 'oversampling'),
         origin=_as_origin(origin, images.shape[1:]),
@@ -378,7 +378,7 @@ def _fit_image(problem, spaces, image, weight, start):
         solution = search(stamp, problem, spaces)
     else:
         solution = run(stamp, problem, spaces,
-                       shapes_of(start, problem, stamp.centre))
+                       stamp_shapes(start, problem, stamp.centre))
     if problem.astrometric and solution.has_flux:
         solution = refine_astrometry(stamp, problem, spaces, solution)
     if not solution.has_flux:

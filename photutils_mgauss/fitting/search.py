@@ -14,6 +14,7 @@ import numpy as np
 from photutils_mgauss import kernels
 from photutils_mgauss.fitting.phases import phase_rows
 from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.psf.rows import log_rows
 
 # Rows of pixels are a multiple of this long, which makes loops over them
 # vectors without remainder.
@@ -47,7 +48,7 @@ _LEAST_FINALISTS = 2
 _PREVIEW_TRIAL_STEPS, _PREVIEW_STEPS = 6, 20
 
 
-class Problem(NamedTuple):
+class StampProblem(NamedTuple):
     """What is asked of every image of a stack."""
 
     n_components: int
@@ -342,18 +343,16 @@ def _widening(t, factor):
 
 # Between shapes and mixtures.
 
-def shapes_of(mixture, problem, centre):
+def stamp_shapes(mixture, problem, centre):
     """Return the shapes (K, 5) of a mixture in stamp pixels."""
     pitch = problem.pitch
     means = mixture.means * pitch + problem.origin - centre
     if problem.fixed:
         means = np.zeros_like(means)
-    covariances = mixture.covariances * pitch * pitch[:, None]
-    sxx, sxy, syy = (covariances[:, 0, 0], covariances[:, 0, 1],
-                     covariances[:, 1, 1])
-    length = np.sqrt(syy / (sxx * syy - sxy**2))
-    return np.column_stack([means, np.log(length), -length * sxy / syy,
-                            -0.5 * np.log(syy)])
+    logs = log_rows(np.ones(len(means)), means,
+                    mixture.covariances * pitch * pitch[:, None])
+    return np.column_stack([means, logs[:, 3],
+                            -np.exp(logs[:, 3]) * logs[:, 4], logs[:, 5]])
 
 
 def narrow_first(solution):

@@ -14,8 +14,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from photutils_mgauss import kernels
-from photutils_mgauss.psf.gridded import GriddedMixturePSF
-from photutils_mgauss.psf.model import MultiGaussianPSFModel
+from photutils_mgauss.psf.base import PSFModel
 from photutils_mgauss.utils.parallel import map_parallel
 
 CONVERGED = (kernels.CONVERGED, kernels.STALLED)
@@ -27,7 +26,7 @@ _CHUNK = 4000
 
 
 @dataclass(frozen=True, eq=False)
-class Image:
+class KernelImage:
     """
     The pixels of an image, as the kernels take them.
 
@@ -72,38 +71,34 @@ def _full_mask(data, mask):
     return np.empty((0, 0), bool) if finite.all() else ~finite
 
 
+def as_model(psf):
+    """Return a PSF as a model; fields are sampled on a grid."""
+    return psf.to_grid() if hasattr(psf, 'to_grid') else psf
+
+
 def psf_arrays(model):
     """
     Return the kernels' form of a PSF model.
 
     Returns
     -------
-    nodes, paces, x_grid, y_grid, integrated : tuple
+    nodes, strides, x_grid, y_grid, integrated : tuple
         The mixtures at the nodes (M, K, 6), what the kernels precompute of
         them (M, K, 4), the axes of the grid, and whether they are integrated
         over pixels.
     """
-    if isinstance(model, GriddedMixturePSF):
-        grid = model._grid
-        rows, x_grid, y_grid = grid.rows, grid.x_grid, grid.y_grid
-    else:
-        rows = model.mixture.rows[None]
-        x_grid = y_grid = np.zeros(1)
+    grid = model.grid
     rows, x_grid, y_grid = (_as_kernels_take(a, np.float64)
-                            for a in (rows, x_grid, y_grid))
-    paces = np.empty((*rows.shape[:2], 4))
-    kernels.strides(rows, paces)
-    return rows, paces, x_grid, y_grid, model.pixel_integrated
+                            for a in (grid.rows, grid.x_grid, grid.y_grid))
+    strides = np.empty((*rows.shape[:2], 4))
+    kernels.strides(rows, strides)
+    return rows, strides, x_grid, y_grid, model.pixel_integrated
 
 
 def is_fixed_shape(model):
     """Return whether the kernels can fit all that is free in a model."""
-    if not isinstance(model, (GriddedMixturePSF, MultiGaussianPSFModel)):
-        return False
-    if isinstance(model, GriddedMixturePSF) and (
-            model.interpolation, model.outside) != ('blend', 'clamp'):
-        return False
-    return all(getattr(model, name).fixed for name in model.param_names[3:])
+    return (isinstance(model, PSFModel) and model.has_fixed_shape
+            and (model.interpolation, model.outside) == ('blend', 'clamp'))
 
 
 def cut_boxes(x, y, fit_shape, data_shape):
@@ -143,7 +138,7 @@ def count_pixels(image, boxes):
 
 
 @dataclass(frozen=True, eq=False)
-class Stars:
+class StarGroups:
     """
     What is to be fitted: n stars, those of a group next to each other.
 
@@ -184,9 +179,10 @@ class Stars:
     def _part(self, first, last):
         starts = self.starts[first:last + 1]
         rows = slice(starts[0], starts[-1])
-        return Stars(self.initial[rows], self.boxes[rows], self.sky[rows],
-                     starts - starts[0], self.lower[rows], self.upper[rows],
-                     self.fixed)
+        return StarGroups(
+            self.initial[rows], self.boxes[rows], self.sky[rows],
+            starts - starts[0], self.lower[rows], self.upper[rows],
+            self.fixed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,10 +250,10 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
 
     Parameters
     ----------
-    image : Image
+    image : KernelImage
     psf : tuple
         See `psf_arrays`.
-    stars : Stars
+    stars : StarGroups
     fit_sky : bool, optional
         Whether to fit a level of the sky to each group, too.
     max_iterations : int, optional

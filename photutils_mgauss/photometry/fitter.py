@@ -22,7 +22,7 @@ from photutils_mgauss.utils.validation import as_integer
 
 __all__ = ['MixtureFitter']
 
-_MESSAGES = {
+MESSAGES = {
     0: 'The fit stopped at its largest number of iterations.',
     2: 'The sum of squares does not get smaller any more.',
     3: 'The next step is expected to be below the tolerance.',
@@ -121,11 +121,11 @@ class MixtureFitter:
 
     @fitter_unit_support
     def _fit_with_units(self, model, x, y, z, *, weights, maxiter, inplace):
-        problem = _Problem(model, x, y, z, weights)
+        problem = _PixelProblem(model, x, y, z, weights)
         state, status, n_steps = _minimize(problem, maxiter)
         self.fit_info = {
             'param_cov': problem.covariance(state), 'fun': state.residuals,
-            'status': status, 'message': _MESSAGES[status], 'nfev': n_steps}
+            'status': status, 'message': MESSAGES[status], 'nfev': n_steps}
         fitted = model if inplace else model.copy()
         fitted.parameters = problem.full(state.values)
         return fitted
@@ -173,7 +173,7 @@ class _State:
                       initial=0)
 
 
-class _Problem:
+class _PixelProblem:
     """Weighted residuals and Jacobian as functions of the free parameters."""
 
     def __init__(self, model, x, y, z, weights):

@@ -21,7 +21,8 @@ from astropy.table import QTable
 
 from photutils_mgauss import kernels
 from photutils_mgauss.photometry.engine import (
-    Image,
+    KernelImage,
+    as_model,
     cut_boxes,
     is_fixed_shape,
     psf_arrays,
@@ -337,13 +338,13 @@ class _Images:
 
 
 def _read_image(entry):
-    """Return Image, PSF arrays, WCS and unit of one (data, psf, wcs)."""
+    """Return KernelImage, PSF arrays, WCS and unit of one (data, psf, wcs)."""
     if len(entry) != 3:
         msg = f'images must hold (data, psf, wcs), got {len(entry)} things'
         raise ValueError(msg)
     data, psf, wcs = entry
     check_celestial(wcs)
-    psf = psf.to_grid() if hasattr(psf, 'to_grid') else psf
+    psf = as_model(psf)
     if not is_fixed_shape(psf):
         msg = f'images must hold PSFs of fixed shape, got {psf!r:.80}'
         raise TypeError(msg)
@@ -358,7 +359,8 @@ def _read_image(entry):
     if np.ndim(data) != 2:
         msg = f'images must hold 2-D data, got {np.ndim(data)} dimensions'
         raise ValueError(msg)
-    return Image.from_arrays(data, error, mask), psf_arrays(psf), wcs, unit
+    image = KernelImage.from_arrays(data, error, mask)
+    return image, psf_arrays(psf), wcs, unit
 
 
 def _boxes(xy, fit_shape, data_shape):

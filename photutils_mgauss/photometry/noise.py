@@ -18,7 +18,13 @@ import numpy as np
 from photutils.utils import calc_total_error
 
 from photutils_mgauss import kernels
-from photutils_mgauss.photometry.engine import cut_boxes, psf_arrays
+from photutils_mgauss.photometry.engine import (
+    as_model,
+    cut_boxes,
+    psf_arrays,
+)
+from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.psf.model import MultiGaussianPSFModel
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = ['CramerRao', 'cramer_rao', 'pixel_error']
@@ -78,14 +84,8 @@ def pixel_error(light, *, sky=0, read_noise=0, gain=1, exposure_time=None):
         of it. Errors from the image are too small where noise made a pixel
         faint, and weighted fluxes come out low; with a model they do not.
         Negative light counts as none.
-    sky : float or (ny, nx) array_like, optional
-        The level of the sky, in the unit of the image.
-    read_noise : float, optional
-        The noise of the readout [electron].
-    gain : float, optional
-        Electrons in a count; 1 for images in electrons.
-    exposure_time : float, optional
-        If given, the image is a rate and this is its exposure time [s].
+    sky, read_noise, gain, exposure_time : optional
+        As for `background_error`; ``sky`` may be an image.
 
     Returns
     -------
@@ -178,12 +178,8 @@ def cramer_rao(psf, flux, sky=0, *, x=0, y=0, read_noise=0, gain=1,
         The level of the sky, in the unit of the image.
     x, y : (n,) array_like, optional
         The positions [pix].
-    read_noise : float, optional
-        The noise of the readout [electron].
-    gain : float, optional
-        Electrons in a count; 1 for images in electrons.
-    exposure_time : float, optional
-        If given, the image is a rate and this is its exposure time [s].
+    read_noise, gain, exposure_time : float, optional
+        As for `background_error`.
     fit_shape : int or (ny, nx) tuple of int, optional
         The pixels used of each star.
     free_sky : bool, optional
@@ -248,13 +244,9 @@ class _Jets:
 
 
 def _jet_arrays(psf):
-    from photutils_mgauss.psf.mixture import GaussianMixture
-    from photutils_mgauss.psf.model import MultiGaussianPSFModel
     if isinstance(psf, GaussianMixture):
         psf = MultiGaussianPSFModel(psf)
-    if hasattr(psf, 'to_grid'):
-        psf = psf.to_grid()
-    return psf_arrays(psf)
+    return psf_arrays(as_model(psf))
 
 
 def _bound(jet, flux, noise, free_sky):

@@ -22,7 +22,6 @@ from photutils.psf import PSFPhotometry
 from photutils_mgauss.photometry import engine
 from photutils_mgauss.photometry import table as _table
 from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
-from photutils_mgauss.photometry.result import FitInfo, FitResult
 from photutils_mgauss.utils import compat
 from photutils_mgauss.utils.validation import as_choice, as_real
 
@@ -113,10 +112,9 @@ class MixturePSFPhotometry(PSFPhotometry):
     def __init__(self, psf_model, fit_shape, *, fitter=None, executor=None,
                  fit_sky=False, effective_gain=None, variance='model',
                  xy_cov=False, aperture_radius_correction=None, **kwargs):
-        if hasattr(psf_model, 'to_grid'):
-            psf_model = psf_model.to_grid()
         fitter = MixtureFitter() if fitter is None else fitter
-        super().__init__(psf_model, fit_shape, fitter=fitter, **kwargs)
+        super().__init__(engine.as_model(psf_model), fit_shape, fitter=fitter,
+                         **kwargs)
         self.executor = executor
         self.fit_sky = bool(fit_sky)
         self.effective_gain = (
@@ -225,7 +223,7 @@ class MixturePSFPhotometry(PSFPhotometry):
             error = np.sqrt(background
                             + np.maximum(data, 0, dtype=float) / gain)
             gain = None
-        return engine.Image.from_arrays(data, error, mask, gain)
+        return engine.KernelImage.from_arrays(data, error, mask, gain)
 
     def _fit(self, image, init_params):
         """Return the FitResult and the group sizes of all stars."""
@@ -256,7 +254,7 @@ class MixturePSFPhotometry(PSFPhotometry):
         columns |= self._extra_columns(result)
         table, rows = _table.assemble(self.init_params, group_size, columns,
                                       compat.results_meta(self))
-        self.fit_info = FitInfo(result, rows)
+        self.fit_info = _table.FitInfo(result, rows)
         return table
 
     def _extra_columns(self, result):
@@ -342,16 +340,16 @@ class _Start:
         """Return the stars of the rows, ready to be fitted."""
         # A background that is not finite is not subtracted, only flagged.
         sky = np.where(np.isfinite(self.local_bkg), self.local_bkg, 0.0)
-        return engine.Stars(self.initial[rows], self.boxes[rows],
-                            sky[rows], starts, self.lower[rows],
-                            self.upper[rows], fixed)
+        return engine.StarGroups(
+            self.initial[rows], self.boxes[rows], sky[rows], starts,
+            self.lower[rows], self.upper[rows], fixed)
 
     def result(self, rows, fits):
         """Return the results of all stars, of which rows were fitted."""
         full = engine.Fits.empty(len(self.initial))
         for target, source in zip(full.arrays, fits.arrays, strict=True):
             target[rows] = source
-        return FitResult(
+        return _table.FitResult(
             self.initial, self.lower, self.upper, self.local_bkg,
             self.n_pixels, self.reasons, self.valid, self.free,
             self.flagged_bounds, full.values, full.covariances, full.sky,
@@ -404,11 +402,11 @@ def aperture_correction(psf_model, x, y, radius):
 
 def encircled_energy(psf_model, x, y, radius):
     """Return the fraction of a star's flux within a radius, (n,)."""
-    grid = getattr(psf_model, '_grid', None)
-    if grid is None:
-        return np.full(x.shape, psf_model.mixture.encircled_energy(radius))
+    grid = psf_model.grid
     nodes = np.array([grid.node(m).encircled_energy(radius)
                       for m in range(len(grid.scales))])
+    if nodes.size == 1:
+        return np.full(x.shape, nodes[0])
     out = np.empty(x.size)
     for i in range(x.size):
         index, share = grid.neighbours(x[i], y[i])

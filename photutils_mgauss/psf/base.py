@@ -37,6 +37,11 @@ class PSFModel(Fittable2DModel):
 
     Subclasses add `evaluate`, `fit_deriv`, ``_state`` (what is not in
     Parameters, hashable) and ``_half_size`` (of the bounding box).
+
+    Every model is a grid of nodes, and whoever draws or fits stars with one
+    asks for its ``grid``, ``pixel_integrated``, ``interpolation`` and
+    ``outside`` alone. One mixture is a grid of one node, for which it makes
+    no difference how nodes are put together.
     """
 
     flux = PSFParameter(default=1, description='Total flux of the star.')
@@ -47,6 +52,9 @@ class PSFModel(Fittable2DModel):
     # its flux.
     bbox_factor = 5.5
 
+    interpolation = 'blend'
+    outside = 'clamp'
+
     if compat.STALE_GROUP_MODELS:
         __class__ = property(compat.group_class)
 
@@ -56,6 +64,23 @@ class PSFModel(Fittable2DModel):
 
     def _finish(self):
         self._ready = True
+
+    def _described(self, details=''):
+        """Return the text of ``repr``; details stand before the number."""
+        pixel = ', pixel_integrated=True' if self._pixel_integrated else ''
+        return (f'<{type(self).__name__}(flux={self.flux.value:g}, '
+                f'x_0={self.x_0.value:g}, y_0={self.y_0.value:g}, {details}'
+                f'n_components={self.n_components}{pixel})>')
+
+    @property
+    def pixel_integrated(self):
+        """Whether mixtures are integrated over pixels, not sampled."""
+        return self._pixel_integrated
+
+    @property
+    def has_fixed_shape(self):
+        """Whether nothing is free but the flux and the position."""
+        return all(getattr(self, name).fixed for name in self.param_names[3:])
 
     @property
     def bounding_box(self):

@@ -5,6 +5,7 @@ The constructors that must fit call the room `fitting`, which stands above
 this one, when they are called.
 """
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 from photutils.psf import GriddedPSFModel
@@ -64,13 +65,10 @@ class GridConversions:
         array([[[2., 0.],
                 [0., 1.]]])
         """
-        options = {'radius': radius, 'executor': executor,
-                   'progress_bar': progress_bar, **kwargs}
-        if isinstance(psf, Mapping):
-            return {name: cls.from_gridded_psf(one, n_components, **options)
-                    for name, one in psf.items()}
         from photutils_mgauss.fitting import grid
-        return grid.fit_gridded_psf(psf, n_components, **options)
+        return _of_each(psf, partial(
+            grid.fit_gridded_psf, n_components=n_components, radius=radius,
+            executor=executor, progress_bar=progress_bar, **kwargs))
 
     @classmethod
     def from_psfex(cls, path, n_components=3, *, grid_shape=(30, 30),
@@ -106,13 +104,10 @@ class GridConversions:
         ValueError
             If the file is not a PSFEx model, see `read_psfex`.
         """
-        options = {'grid_shape': grid_shape, 'limits': limits,
-                   'contexts': contexts, **kwargs}
-        if isinstance(path, Mapping):
-            return {name: cls.from_psfex(one, n_components, **options)
-                    for name, one in path.items()}
         from photutils_mgauss.fitting import grid
-        return grid.fit_psfex(path, n_components, **options)
+        return _of_each(path, partial(
+            grid.fit_psfex, n_components=n_components, grid_shape=grid_shape,
+            limits=limits, contexts=contexts, **kwargs))
 
     @classmethod
     def from_image_psf(cls, psf, n_components=3, *, grid_xypos=None,
@@ -260,6 +255,13 @@ class GridConversions:
         `matplotlib.figure.Figure`
         """
         return self.to_gridded_psf(2).plot_grid(**kwargs)
+
+
+def _of_each(source, make):
+    """Return what is made of a source, or of each of a dict of them."""
+    if isinstance(source, Mapping):
+        return {name: make(one) for name, one in source.items()}
+    return make(source)
 
 
 def _galsim_gaussian(weight, mean, covariance, scale, galsim):

@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.mixture import GaussianMixture, _check_covariances
-from photutils_mgauss.psf.rows import kernel_rows
+from photutils_mgauss.psf.rows import integrals, kernel_rows, of_integrals
 from photutils_mgauss.utils.validation import as_floats
 
 __all__ = ['Grid', 'make_grid']
@@ -57,6 +57,12 @@ class Grid:
         object.__setattr__(self, 'serial', next(_serial))
         for array in self.arrays:
             array.flags.writeable = False
+
+    @classmethod
+    def of_mixture(cls, mixture):
+        """Return the grid of one node."""
+        return cls(np.zeros(1), np.zeros(1), mixture.weights[None],
+                   mixture.means[None], mixture.covariances[None], np.ones(1))
 
     @property
     def arrays(self):
@@ -112,22 +118,10 @@ class Grid:
         return from_integrals(np.tensordot(share, self.sums[index], 1))
 
 
-def integrals(weights, means, covariances):
-    """Return the integrals of 1, x, y, x^2, xy, y^2, (..., K, 6)."""
-    x, y = means[..., 0], means[..., 1]
-    moments = [np.ones_like(x), x, y, covariances[..., 0, 0] + x * x,
-               covariances[..., 0, 1] + x * y, covariances[..., 1, 1] + y * y]
-    return weights[..., None] * np.stack(moments, axis=-1)
-
-
 def from_integrals(sums):
     """Return the mixture of K Gaussians with these integrals (K, 6)."""
-    sums = sums[sums[:, 0] != 0]
-    _, x, y, xx, xy, yy = (sums / sums[:, :1]).T
-    covariances = np.stack([xx - x * x, xy - x * y, xy - x * y, yy - y * y],
-                           axis=-1).reshape(-1, 2, 2)
-    return GaussianMixture(sums[:, 0] / sums[:, 0].sum(),
-                           np.column_stack([x, y]), covariances)
+    weights, *shapes = of_integrals(sums[sums[:, 0] != 0])
+    return GaussianMixture(weights / weights.sum(), *shapes)
 
 
 def overlap(a, b):
@@ -136,14 +130,10 @@ def overlap(a, b):
 
     Each of a and b is a triple of weights, means and covariances.
     """
-    offset = a[1][:, None] - b[1]
-    total = a[2][:, None] + b[2]
-    det = total[..., 0, 0] * total[..., 1, 1] - total[..., 0, 1] ** 2
-    dx, dy = offset[..., 0], offset[..., 1]
-    square = (total[..., 1, 1] * dx**2 - 2 * total[..., 0, 1] * dx * dy
-              + total[..., 0, 0] * dy**2) / det
-    return (a[0][:, None] * b[0] * np.exp(-0.5 * square)
-            / (2 * np.pi * np.sqrt(det)))
+    height, dx, dy, p, s, q = np.moveaxis(kernel_rows(
+        a[0][:, None] * b[0], a[1][:, None] - b[1], a[2][:, None] + b[2]),
+        -1, 0)
+    return height * np.exp(-0.5 * (p * (dx - s * dy) ** 2 + q * dy**2))
 
 
 def match(a, b):

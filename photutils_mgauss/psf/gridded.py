@@ -166,6 +166,11 @@ n_components=1)>
         return self._report.copy()
 
     @property
+    def grid(self):
+        """The mixtures at the nodes as arrays, see `PSFModel`."""
+        return self._grid
+
+    @property
     def grid_xypos(self):
         """The positions (x, y) of the nodes by y, then x, (M, 2) [pix]."""
         return self._grid.positions
@@ -191,11 +196,6 @@ n_components=1)>
         return self._grid.weights.shape[1]
 
     @property
-    def pixel_integrated(self):
-        """Whether mixtures are integrated over pixels, not sampled."""
-        return self._pixel_integrated
-
-    @property
     def interpolation(self):
         """How neighbouring nodes are put together."""
         return self._interpolation
@@ -211,11 +211,7 @@ n_components=1)>
                 self._interpolation, self._outside)
 
     def __repr__(self):
-        pixel = ', pixel_integrated=True' if self._pixel_integrated else ''
-        return (f'<GriddedMixturePSF(flux={self.flux.value:g}, '
-                f'x_0={self.x_0.value:g}, y_0={self.y_0.value:g}, '
-                f'grid_shape={self.grid_shape}, '
-                f'n_components={self.n_components}{pixel})>')
+        return self._described(f'grid_shape={self.grid_shape}, ')
 
     def evaluate(self, x, y, flux, x_0, y_0):
         """

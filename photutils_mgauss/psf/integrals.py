@@ -14,8 +14,8 @@ def polar_integral(mixture, radius, n_angles):
     ray = np.stack([np.cos(angle), np.sin(angle)])
     total = np.zeros((radius.size, n_angles))
     precisions = np.linalg.inv(mixture.covariances)
-    for w, m, p in zip(mixture.weights, mixture.means, precisions,
-                       strict=True):
+    for height, m, p in zip(mixture.rows[:, 0], mixture.means, precisions,
+                            strict=True):
         a = np.einsum('it,ij,jt->t', ray, p, ray)
         h = (m @ p @ ray) / a
         peak = np.exp(-0.5 * (m @ p @ m - a * h**2))
@@ -25,5 +25,5 @@ def polar_integral(mixture, radius, n_angles):
                    - np.exp(-0.5 * a * (r - h) ** 2)) / a
                   + h * np.sqrt(np.pi) / (2 * root)
                   * (erf(root * (r - h)) + erf(root * h)))
-        total += w * np.sqrt(np.linalg.det(p)) / (2 * np.pi) * peak * inside
+        total += height * peak * inside
     return total.mean(axis=1) * 2 * np.pi

@@ -11,21 +11,12 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from photutils_mgauss import kernels
+from photutils_mgauss.psf.rows import kernel_rows
 
 MAX_WING = 60
 # A cell's families are merged if that changes no pixel by more than this
 # fraction of the peak.
 _MERGE_TOLERANCE = 1e-3
-
-
-def _rows(weights, means, covariances):
-    """Return the kernels' rows of arrays of Gaussians (..., 6)."""
-    sxx = covariances[..., 0, 0]
-    sxy = covariances[..., 0, 1]
-    syy = covariances[..., 1, 1]
-    det = sxx * syy - sxy**2
-    return np.stack([weights / (2 * np.pi * np.sqrt(det)), means[..., 0],
-                     means[..., 1], syy / det, sxy / syy, 1 / syy], axis=-1)
 
 
 def cells(position, nodes):
@@ -150,8 +141,8 @@ class LocalPSF:
         rows[one, :k] = _merge(weights[one], means[one], covariances[one])
         four = ~merged
         if four.any():
-            rows[four] = _rows(weights, means, covariances)[four].reshape(
-                -1, 4 * k, 6)
+            rows[four] = kernel_rows(weights[four], means[four],
+                                     covariances[four]).reshape(-1, 4 * k, 6)
         return rows, count
 
     @staticmethod
@@ -190,4 +181,5 @@ def _merge(weights, means, covariances):
     mean = (part[..., None] * means).sum(axis=1)
     offset = means - mean[:, None]
     spread = covariances + offset[..., :, None] * offset[..., None, :]
-    return _rows(total, mean, (part[..., None, None] * spread).sum(axis=1))
+    return kernel_rows(total, mean,
+                       (part[..., None, None] * spread).sum(axis=1))

@@ -14,7 +14,7 @@ import numpy as np
 from photutils_mgauss import kernels
 from photutils_mgauss.files.storage import storable
 from photutils_mgauss.psf.integrals import polar_integral
-from photutils_mgauss.psf.rows import kernel_rows
+from photutils_mgauss.psf.rows import kernel_rows, matrices
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = ['GaussianMixture', 'Moments', 'blend']
@@ -155,10 +155,8 @@ class GaussianMixture:
                    f'{rho[np.abs(rho).argmax()]}')
             raise ValueError(msg)
         cross = rho * stddevs[:, 0] * stddevs[:, 1]
-        covariances = np.empty((len(stddevs), 2, 2))
-        covariances[:, [0, 1], [0, 1]] = stddevs**2
-        covariances[:, 0, 1] = covariances[:, 1, 0] = cross
-        return cls(weights, means, covariances)
+        xx, yy = stddevs.T**2
+        return cls(weights, means, matrices(xx, cross, yy))
 
     @property
     def n_components(self):
@@ -217,10 +215,8 @@ class GaussianMixture:
 
         Parameters
         ----------
-        x, y : array_like
-            Positions relative to the star [pix]; they broadcast.
-        pixel_integrated : bool, optional
-            Whether to differentiate the integral over the unit pixel.
+        x, y, pixel_integrated
+            As for `evaluate`; what is differentiated is what it returns.
 
         Returns
         -------

@@ -22,7 +22,9 @@ from photutils_mgauss.psf.base import (
     strip_units,
     with_unit,
 )
+from photutils_mgauss.psf.grid import Grid
 from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.psf.rows import kernel_rows_of_stddevs
 from photutils_mgauss.utils.validation import as_integer
 
 __all__ = ['MultiGaussianPSFModel']
@@ -122,19 +124,11 @@ class MultiGaussianPSFModel(PSFModel):
         return self._n_components
 
     @property
-    def pixel_integrated(self):
-        """Whether the mixture is integrated over pixels, not sampled."""
-        return self._pixel_integrated
-
-    @property
     def _state(self):
         return self._n_components, self._pixel_integrated
 
     def __repr__(self):
-        pixel = ', pixel_integrated=True' if self._pixel_integrated else ''
-        return (f'<MultiGaussianPSFModel(flux={self.flux.value:g}, '
-                f'x_0={self.x_0.value:g}, y_0={self.y_0.value:g}, '
-                f'n_components={self._n_components}{pixel})>')
+        return self._described()
 
     @property
     def _shape_parameters(self):
@@ -151,6 +145,11 @@ class MultiGaussianPSFModel(PSFModel):
         shape = _Shape(self._shape_parameters)
         return GaussianMixture.from_stddevs(shape.weights, shape.means,
                                             shape.stddevs, shape.rho)
+
+    @property
+    def grid(self):
+        """The mixture as a grid of one node, see `PSFModel`."""
+        return Grid.of_mixture(self.mixture)
 
     def free_shape(self):
         """
@@ -325,11 +324,7 @@ class _Shape:
     @property
     def unit_rows(self):
         """The kernels' rows of Gaussians of unit flux each, (K, 6)."""
-        sx, sy = self.stddevs.T
-        p = 1 / (sx**2 * (1 - self.rho) * (1 + self.rho))
-        q = sy**-2
-        return np.column_stack([np.sqrt(p * q) / (2 * np.pi), self.means, p,
-                                self.rho * sx / sy, q])
+        return kernel_rows_of_stddevs(1.0, self.means, self.stddevs, self.rho)
 
     def weight_slopes(self):
         """Return d weight_j / d fraction_i, (K - 1, K)."""

@@ -21,26 +21,16 @@ from photutils_mgauss.simulation.bound import (
     covariances,
     draw_table,
 )
-from photutils_mgauss.simulation.catalogues import (
-    PAPER_DENSITY,
-    crowded_field,
-    sky_field,
-    sparse_field,
-)
 from photutils_mgauss.simulation.effects import DetectorEffects
-from photutils_mgauss.simulation.exposures import Exposure, paper_exposures
+from photutils_mgauss.simulation.exposures import Exposure
 from photutils_mgauss.simulation.image import Chip, draw, expose, read
-from photutils_mgauss.simulation.instrument import CSST_BANDS, Band, Instrument
+from photutils_mgauss.simulation.instrument import Instrument
 from photutils_mgauss.simulation.mock_psf import csst_psf
-from photutils_mgauss.simulation.optics import Optics
 from photutils_mgauss.simulation.renderer import brush_of, widen
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
-__all__ = [
-    'CSST_BANDS', 'PAPER_DENSITY', 'Band', 'DetectorEffects', 'Exposure',
-    'Instrument', 'Optics', 'Scene', 'SimulatedCatalogue', 'crowded_field',
-    'csst_psf', 'paper_exposures', 'render_stars', 'simulate',
-    'simulate_catalogues', 'simulate_epochs', 'sky_field', 'sparse_field']
+__all__ = ['Scene', 'render_stars', 'simulate', 'simulate_catalogues',
+           'simulate_epochs']
 
 # Sources farther than this from the image are not part of its truth [pix].
 _MARGIN = 64

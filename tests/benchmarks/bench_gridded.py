@@ -15,6 +15,7 @@ from astropy.table import QTable
 from photutils.psf import PSFPhotometry
 
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF
+from photutils_mgauss.fitting.grid import fit_node_images
 from photutils_mgauss.fitting.node_images import NodeImages
 from photutils_mgauss.utils.parallel import available_cores
 
@@ -138,12 +139,11 @@ def bench_focal_plane(n_nodes):
     axis = np.arange(30.0)
     places = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     nodes = NodeImages(images, places, (2, 2))
-    GriddedMixturePSF._fitted(NodeImages(images[:4], places[[0, 1, 30, 31]],
-                                         (2, 2)), 3)
+    fit_node_images(NodeImages(images[:4], places[[0, 1, 30, 31]], (2, 2)), 3)
     start, done = time.perf_counter(), 0
     used = time.process_time()
     while done < n_nodes:
-        psf = GriddedMixturePSF._fitted(nodes, 3)
+        psf = fit_node_images(nodes, 3)
         done += len(psf.report)
     wall, used = time.perf_counter() - start, time.process_time() - used
     print(f'fit {done} nodes of 30x30 at 2x, K = 3, with report: {wall:.1f} s '

@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-from photutils_mgauss.simulation.scene import Optics, render_stars
+from photutils_mgauss.simulation import Optics, render_stars
 
 
 def deviation(optics, psf, x, y, half=12):

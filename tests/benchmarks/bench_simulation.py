@@ -12,7 +12,7 @@ import numpy as np
 from astropy.table import QTable
 from photutils.datasets import make_model_image
 
-from photutils_mgauss.simulation.scene import (
+from photutils_mgauss.simulation import (
     Instrument,
     crowded_field,
     csst_psf,

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from photutils_mgauss import CrowdedMixturePhotometry, fit_mixture_field
-from photutils_mgauss.simulation.scene import (
+from photutils_mgauss.simulation import (
     Instrument,
     crowded_field,
     simulate,

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from photutils_mgauss import GaussianMixture, fit_mixture_field
 from photutils_mgauss.field.forms import FreeShapes
 from photutils_mgauss.field.normal import (
-    Problem,
+    FieldProblem,
     Workers,
     equations,
     to_coefficients,
@@ -169,9 +169,10 @@ def small_problem(rng, local):
     sources[0, 1] = 13, 10, 900
     hold = np.full(sources.shape, 0.01)
     basis = np.column_stack([np.ones(4), [-1, 1, 0.3, 0], [0.5, 0, -1, 1]])
-    return Problem(stamps, good / 1.0, basis, sources, sources.copy(), hold,
-                   np.array([2, 1, 1, 1]), np.zeros(4), True,
-                   np.ones(4, bool), np.zeros(4, int), FreeShapes(), local)
+    return FieldProblem(
+        stamps, good / 1.0, basis, sources, sources.copy(), hold,
+        np.array([2, 1, 1, 1]), np.zeros(4), True, np.ones(4, bool),
+        np.zeros(4, int), FreeShapes(), local)
 
 
 def test_one_absurdly_bright_blend_is_dropped(stars, clean):

@@ -10,12 +10,8 @@ from photutils_mgauss import (
     assess_psf,
     fit_mixture_field,
 )
-from photutils_mgauss.field.forms import (
-    TunedShapes,
-    convolved,
-    covariances_of,
-    shapes_of,
-)
+from photutils_mgauss.field.forms import TunedShapes, convolved
+from photutils_mgauss.psf.rows import covariances_of_logs, log_rows
 
 SHAPE = (300, 260)
 
@@ -170,17 +166,20 @@ def test_a_start_without_mixtures_is_an_error(fifteen):
 
 def test_a_small_convolution_is_exact_and_a_large_negative_one_is_valid():
     mixture = archive_at(30, 200)
-    shapes = shapes_of(mixture)[0][None]
+    shapes = log_rows(mixture.weights, mixture.means,
+                      mixture.covariances)[None]
     blur = np.array([[0.4, 0.1, 0.7]])
     expected = mixture.covariances + np.array([[0.4, 0.1], [0.1, 0.7]])
-    assert_allclose(covariances_of(convolved(shapes, blur))[0], expected,
+    assert_allclose(covariances_of_logs(convolved(shapes, blur))[0], expected,
                     rtol=1e-12)
-    sharp = covariances_of(convolved(shapes, -20 * blur))
+    sharp = covariances_of_logs(convolved(shapes, -20 * blur))
     assert np.all(np.linalg.eigvalsh(sharp) >= 0)
 
 
 def test_jacobians_are_the_slopes_of_the_shapes_relative_to_the_first():
-    shapes, sign = shapes_of(archive_at(30, 200))
+    mixture = archive_at(30, 200)
+    shapes = log_rows(mixture.weights, mixture.means, mixture.covariances)
+    sign = np.sign(mixture.weights)
     local = TunedShapes.local(shapes[None], sign)
     numbers = np.array([[0.2, 0.1, -0.1, 0.05, 0.1, 0.02]])
     basis = np.ones((1, 1))

@@ -7,14 +7,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import label
 
 from helpers.small_camera import SMALL, one_star
-from photutils_mgauss.simulation.effects import bleed, pattern
-from photutils_mgauss.simulation.scene import (
+from photutils_mgauss.simulation import (
     DetectorEffects,
     Exposure,
     Instrument,
     crowded_field,
     simulate,
 )
+from photutils_mgauss.simulation.effects import bleed, pattern
 
 
 def test_without_effects_nothing_is_flagged_and_a_pattern_is_flat():

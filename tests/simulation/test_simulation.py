@@ -17,8 +17,7 @@ from photutils.psf import PSFPhotometry
 from helpers.small_camera import SMALL, one_star
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
-from photutils_mgauss.simulation.bound import covariances
-from photutils_mgauss.simulation.scene import (
+from photutils_mgauss.simulation import (
     CSST_BANDS,
     Band,
     DetectorEffects,
@@ -34,6 +33,7 @@ from photutils_mgauss.simulation.scene import (
     sky_field,
     sparse_field,
 )
+from photutils_mgauss.simulation.bound import covariances
 
 # The instrument and the bands.
 

@@ -7,10 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF
-from photutils_mgauss.simulation.brighter_fatter import photons
-from photutils_mgauss.simulation.optics import _interpolation
-from photutils_mgauss.simulation.renderer import widen
-from photutils_mgauss.simulation.scene import (
+from photutils_mgauss.simulation import (
     DetectorEffects,
     Exposure,
     Instrument,
@@ -20,6 +17,9 @@ from photutils_mgauss.simulation.scene import (
     simulate,
     simulate_catalogues,
 )
+from photutils_mgauss.simulation.brighter_fatter import photons
+from photutils_mgauss.simulation.optics import _interpolation
+from photutils_mgauss.simulation.renderer import widen
 
 
 @pytest.fixture(scope='module')
