@@ -13,9 +13,9 @@ a position and its covariance.
 from photutils_mgauss.utils.lazy import hand_on
 
 __getattr__, __dir__, __all__ = hand_on(__name__, {
-    'bootstrap_median': 'fitter',
-    'decode_motion_flags': 'fitter',
-    'Epoch': 'fitter',
-    'MotionSolution': 'fitter',
+    'bootstrap_median': 'bootstrap',
+    'decode_motion_flags': 'solution',
+    'Epoch': 'epoch',
+    'MotionSolution': 'solution',
     'ProperMotionFitter': 'fitter',
 })

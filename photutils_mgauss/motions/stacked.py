@@ -95,3 +95,10 @@ def sandwich_2x2(jacobian, covariance):
     return np.stack([a * a * xx + 2 * a * b * xy + b * b * yy,
                      a * c * xx + (a * d + b * c) * xy + b * d * yy,
                      c * c * xx + 2 * c * d * xy + d * d * yy])
+
+
+def is_definite_2x2(covariance):
+    """Return which of the matrices (3, n) are positive definite."""
+    xx, xy, yy = covariance
+    with np.errstate(invalid='ignore'):
+        return (xx > 0) & (yy > 0) & (xx * yy - xy * xy > 1e-12 * xx * yy)

@@ -154,6 +154,18 @@ def observer_position(observer, years):
     return xyz[:, where.reshape(years.shape)]
 
 
+def observer_positions(observers, years):
+    """
+    Return barycentric positions (3, E, ...) [au] of E observers.
+
+    ``years`` (E, ...) are Julian years; unknown ones (NaN) count as the mean
+    of the others.
+    """
+    return np.stack([
+        observer_position(observer, np.nan_to_num(row, nan=np.nanmean(row)))
+        for observer, row in zip(observers, years, strict=True)], axis=1)
+
+
 def observer_velocity(observer):
     """Return the observer's velocity (3,) in units of light, or None."""
     if (not isinstance(observer, CartesianRepresentation)
