@@ -5,11 +5,12 @@ import numpy as np
 from astropy.table import Table
 
 from photutils_mgauss.motions.epoch import check_epochs, read_epochs
-from photutils_mgauss.motions.identify import (
+from photutils_mgauss.motions.matching import (
+    Matches,
     find_references,
+    match_epochs,
     named_references,
 )
-from photutils_mgauss.motions.matching import Matches, match_epochs
 from photutils_mgauss.motions.references import (
     Catalogue,
     quasars,

@@ -153,7 +153,8 @@ class ProperMotionFitter:
         sightings = assemble(epochs, self.references, self._how_to_match(),
                              options.transform)
         setup, state = prepare(sightings, options)
-        result = _fit_recipe(setup, state)
+        result = (fit(setup, state) if options.recipe != 'paper'
+                  else fit_paper(setup, state))
         return solution_of(result, self._ref_year())
 
     def _ref_year(self):
@@ -189,13 +190,6 @@ class ProperMotionFitter:
                        self.parallax, tuple(prior), bool(self.acceleration),
                        _systematic(self.systematic), clip, self.max_motion,
                        held, self.eps_t, self.rng, self.executor)
-
-
-def _fit_recipe(setup, state):
-    """Return the `Fit` by the recipe that was asked for."""
-    if setup.options.recipe != 'paper':
-        return fit(setup, state)
-    return fit_paper(setup, state)
 
 
 def _check_quantity(value, name, *units):

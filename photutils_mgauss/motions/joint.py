@@ -39,6 +39,7 @@ import numpy as np
 
 from photutils_mgauss.motions.problem import parts
 from photutils_mgauss.motions.stacked import (
+    Summed,
     apply,
     apply_transposed,
     gram,
@@ -130,7 +131,7 @@ def _combine(factor, weighted):
 
 
 @dataclass(frozen=True, eq=False)
-class Reduced:
+class Reduced(Summed):
     """
     The frames' equations S r = rhs, and A^T W A before the elimination.
 
@@ -140,10 +141,6 @@ class Reduced:
     matrix: np.ndarray
     rhs: np.ndarray
     direct: np.ndarray
-
-    def __add__(self, other):
-        return Reduced(self.matrix + other.matrix, self.rhs + other.rhs,
-                       self.direct + other.direct)
 
 
 def reduce_stars(problem):

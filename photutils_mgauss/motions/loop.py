@@ -65,26 +65,26 @@ def finished(setup, state, problem, frames, estimates):
                leak)
 
 
-def build_problem(setup, state):
+def pose(setup, state):
     """Return the `MotionProblem` of the present maps, masks and floors."""
     sightings, transform = setup.sightings, setup.transform
+    ties, priors = _ties(setup, state), setup.priors.without(state.dropped)
     offsets = np.empty_like(sightings.places)
     weights = np.empty_like(sightings.covariance)
     for e, coefficients in enumerate(state.maps):
         aligned = transform.apply(coefficients, sightings.places[:, e])
         offsets[:, e] = aligned - setup.origin
-        weights[:, e] = np.where(
-            state.used[e], invert_2x2(*measured(setup, state, e)), 0.0)
+        covariance = measured(setup, state, e)
+        weights[:, e] = np.where(state.used[e], invert_2x2(*covariance), 0.0)
     if setup.drift is not None:
         stars, drift = setup.drift
         offsets[..., stars] -= drift
     np.nan_to_num(offsets, copy=False)
-    priors = setup.priors.without(state.dropped)
     return MotionProblem(
         offsets, weights, setup.origin, setup.dt,
         sightings.observer if setup.options.parallax else None,
         sightings.plane, transform, priors, setup.options.acceleration,
-        _ties(setup, state))
+        ties)
 
 
 def measured(setup, state, e):
@@ -105,7 +105,7 @@ def _ties(setup, state):
 
 def _step(setup, state):
     """Solve for the frames once; return problem, frames and new maps."""
-    problem = build_problem(setup, state)
+    problem = pose(setup, state)
     reduced = reduce_all(problem, setup.options.executor)
     frames = solve_frames(problem, reduced, relative=setup.relative)
     maps = np.stack([setup.transform.project(one)
@@ -113,15 +113,9 @@ def _step(setup, state):
     return problem, frames, replace(state, maps=maps)
 
 
-def _typical_variance(setup):
-    """Return the median variance of the detections, 1 if there are none."""
-    variance = setup.sightings.covariance[0][setup.sightings.usable]
-    return np.median(variance) if variance.size else 1.0
-
-
 def _align(setup, state):
     """Iterate until the maps stand still."""
-    before, typical = np.inf, np.sqrt(_typical_variance(setup))
+    before, typical = np.inf, np.sqrt(setup.typical_variance)
     for i in range(MAX_ITERATIONS):
         problem, frames, state = _step(setup, state)
         # In units of a typical error.
@@ -149,7 +143,7 @@ def fit(setup, state):
     for _ in range(4 * setup.options.fits_floor):
         floor = _floors(setup, state, problem, frames)
         still = np.allclose(floor, state.floor, rtol=0.02,
-                            atol=1e-3 * _typical_variance(setup))
+                            atol=1e-3 * setup.typical_variance)
         state = replace(state, floor=floor)
         problem, frames, state = _align(setup, state)
         if still:
@@ -166,7 +160,7 @@ def measured_alone(result):
     """Return a `Fit` without priors, in the same frames."""
     if result.setup.relative:
         return result
-    problem = result.problem.without_priors()
+    problem = result.problem.unbound
     estimates = solve(result.setup, problem, result.frames, residuals=True)
     return finished(result.setup, result.state, problem, result.frames,
                     estimates)
@@ -183,7 +177,7 @@ def _review(setup, state, problem, frames):
     if setup.options.fits_floor:
         floor = _floors(setup, state, problem, frames, robust=True)
         moved = np.abs(floor - state.floor) > (
-            0.1 * state.floor + 0.01 * _typical_variance(setup))
+            0.1 * state.floor + 0.01 * setup.typical_variance)
         if moved.any():
             # Residuals are judged once the floors are right: a floor that
             # is too small would make outliers of all bright stars.
@@ -232,10 +226,9 @@ def _discrepant(setup, problem, frames):
     if setup.relative or len(stars) <= setup.transform.n_references:
         return np.empty(0, dtype=int)
     alone = problem.select(stars)
-    unbound = alone.without_priors()
     bound, free = (
         total_chi2(one, solve(setup, one, frames, residuals=True))
-        for one in (alone, unbound))
+        for one in (alone, alone.unbound))
     rise = bound - free
     limit = chi2_limit(setup.options.clip, alone.ranks)
     worst = np.nan_to_num(rise / limit, nan=0.0)

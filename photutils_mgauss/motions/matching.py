@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from photutils_mgauss.motions.epoch import Detections
+from photutils_mgauss.utils.robust import std_about_zero
 
 # Field stars that tie one exposure to the next one before it is matched.
 SAMPLE = 20000
@@ -299,7 +300,7 @@ def _affine_tie(tree, places, reach):
         fit = np.linalg.lstsq(design[:, good].T, target.T, rcond=None)[0].T
         matrix = fit / np.array([1, scale, scale])
         residual = target - fit @ design[:, good]
-        rms = 1.4826 * np.median(np.hypot(*residual)) / np.sqrt(2)
+        rms = std_about_zero(np.hypot(*residual)) / np.sqrt(2)
         reach = min(reach, max(6 * rms, reach / 4))
     return matrix, rms
 
@@ -483,3 +484,71 @@ def _names_of_epochs(matches, detections):
     out = np.empty(n, dtype=names.dtype)
     out[np.argsort(first, kind='stable')] = names
     return out
+
+
+def find_references(catalogue, detections, years, tolerance):
+    """
+    Return the star (k,) of each object of a catalogue, -1 where not seen.
+
+    ``detections`` are those of all stars at E epochs, whose mean Julian
+    years are ``years`` (E,).
+    """
+    if catalogue.ids is not None:
+        return _lookup(catalogue.ids, detections.ids)
+    if not np.isfinite(catalogue.values[:2]).all(axis=0).any():
+        msg = ("references must have a column 'id' or positions to be found "
+               'among the stars')
+        raise ValueError(msg)
+    found = np.full(len(catalogue.kinds), -1)
+    for e, year in enumerate(years):
+        # Epoch by epoch: frames that differ would blur a star's mean place.
+        known = (catalogue.values[:2], catalogue.motion(),
+                 np.nan_to_num(catalogue.year, nan=year))
+        sigma = np.sqrt(detections.covariance[[0, 2], e].mean(axis=0))
+        matches = match_positions([detections.plane[:, e]], [sigma], [year],
+                                  tolerance, known)
+        stars = matches.rows[0, :len(found)]
+        new = (found < 0) & ~np.isin(stars, found)
+        found[new] = stars[new]
+    return found
+
+
+def _lookup(ids, names):
+    ids = np.asarray(ids)
+    if (ids.dtype.kind in 'iuf') != (names.dtype.kind in 'iuf'):
+        msg = (f'references must have identifiers like those of the epochs, '
+               f'got {ids.dtype} and {names.dtype}')
+        raise TypeError(msg)
+    order = np.argsort(names)
+    place = np.searchsorted(names, ids, sorter=order)
+    place = order[np.minimum(place, len(names) - 1)]
+    return np.where(names[place] == ids, place, -1)
+
+
+def named_references(references, names, rows, epochs):
+    """
+    Return the stars that identifiers or a column mark as references.
+
+    ``rows`` (E, n) are those of the stars in the tables of the epochs, -1
+    where they are missing.
+    """
+    if isinstance(references, str):
+        marked = np.zeros(len(names), dtype=bool)
+        for epoch, row in zip(epochs, rows, strict=True):
+            seen = row >= 0
+            marked[seen] |= _marked(epoch.table, references)[row[seen]]
+        return np.flatnonzero(marked)
+    if not np.iterable(references):
+        msg = ('references must be a table, identifiers, or the name of a '
+               f'column of every epoch, got {references!r}')
+        raise TypeError(msg)
+    return _lookup(list(references), names)
+
+
+def _marked(table, name):
+    if name not in table.colnames:
+        msg = (f'references must be a table, identifiers, or the name of a '
+               f'column of every epoch, got {name!r}; there is '
+               f'{table.colnames}')
+        raise ValueError(msg)
+    return np.ma.filled(np.ma.asarray(table[name]), False).astype(bool)

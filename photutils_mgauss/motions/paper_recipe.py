@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from photutils_mgauss.motions.frames import MOTIONS, POSITIONS, Frames
-from photutils_mgauss.motions.loop import build_problem, finished, solve
+from photutils_mgauss.motions.loop import finished, pose, solve
 from photutils_mgauss.motions.priors import Priors
 
 
@@ -89,7 +89,7 @@ def fit_paper(setup, state):
     maps[..., 0] += shift.T
     errors = frame_error(found, dt, setup.options.eps_t)
     state = replace(state, maps=maps, floor=errors.T**2)
-    problem = build_problem(setup, state)
+    problem = pose(setup, state)
     # Eq. 11 takes each coordinate by itself.
     weights = problem.weights.copy()
     weights[1] = 0.0

@@ -69,6 +69,8 @@ class Setup:
         Whether there are no references, and all stars are anchors.
     drift : (stars, displacements) or None
         Known displacements (2, E, k) of k references beyond the model.
+    typical_variance : float
+        Median variance of the detections, 1 if there are none.
     """
 
     sightings: Sightings
@@ -82,6 +84,7 @@ class Setup:
     held: np.ndarray
     relative: bool
     drift: tuple | None
+    typical_variance: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +129,11 @@ def prepare(sightings, options):
     if options.parallax == 'prior':
         priors = add_parallax_prior(priors, len(anchors),
                                     options.parallax_prior)
+    variance = sightings.covariance[0][sightings.usable]
     maps = np.repeat(transform.identity()[None], len(dt), axis=0)
     return (Setup(sightings, options, transform, origin, working, dt, priors,
-                  anchors, held, relative, drift),
+                  anchors, held, relative, drift,
+                  np.median(variance) if variance.size else 1.0),
             State(maps, sightings.usable.copy(), floor,
                   np.empty(0, dtype=int), untied))
 

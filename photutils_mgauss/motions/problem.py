@@ -66,8 +66,9 @@ class MotionProblem:
         out[self.priors.stars] = self.priors.rank
         return out
 
-    def without_priors(self):
-        """Return the problem of stars of which nothing is known."""
+    @property
+    def unbound(self):
+        """The same, had nothing been known of the stars beforehand."""
         return replace(self, priors=Priors.none(self.n_parameters))
 
     def part(self, start, stop):

@@ -20,8 +20,9 @@ import numpy as np
 from photutils_mgauss.motions.frames import Gauge
 from photutils_mgauss.motions.joint import eliminate, scaled_rows
 from photutils_mgauss.motions.problem import MotionProblem, parts
-from photutils_mgauss.motions.stacked import gram
+from photutils_mgauss.motions.stacked import Summed, gram
 from photutils_mgauss.utils.parallel import map_parallel
+from photutils_mgauss.utils.robust import std_about_zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,16 +45,12 @@ class Family:
 
 
 @dataclass(frozen=True, eq=False)
-class Sums:
+class Sums(Summed):
     """Sums over stars: P (m, m), c (m,) and the frames' part (m, q)."""
 
     normal: np.ndarray
     moment: np.ndarray
     frames: np.ndarray
-
-    def __add__(self, other):
-        return Sums(self.normal + other.normal, self.moment + other.moment,
-                    self.frames + other.frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +190,7 @@ def mean_weights(values, covariance, rows, usable):
     """
     middle = np.nanmedian(values[rows][:, usable], axis=1)[:, None]
     away = values[rows] - middle
-    scatter = 1.4826 * np.nanmedian(np.abs(away[:, usable]))
+    scatter = std_about_zero(away[:, usable])
     variance = np.mean([covariance[k, k] for k in rows], axis=0)
     distance = np.abs(away).max(axis=0)
     near = usable & (distance <= 5 * np.sqrt(scatter**2 + variance))

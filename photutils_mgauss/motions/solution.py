@@ -9,11 +9,14 @@ from astropy.table import QTable
 from photutils_mgauss.motions.bootstrap import bootstrap_frames
 from photutils_mgauss.motions.corrected_wcs import correct_epochs
 from photutils_mgauss.motions.loop import Fit, measured_alone
+from photutils_mgauss.motions.propagation import (
+    propagated,
+    star_covariance,
+)
 from photutils_mgauss.motions.tables import (
     FLAGS,
     alignment_table,
     residual_table,
-    star_covariance,
     star_table,
     validation_table,
 )
@@ -52,9 +55,10 @@ def solution_of(result, ref_epoch=None):
     fit's own.
     """
     year = result.setup.working_year if ref_epoch is None else ref_epoch
+    parameters = propagated(result, year)
     corrected, residuals = correct_epochs(result)
     return MotionSolution(
-        star_table(result, year), corrected,
+        star_table(result, year, parameters), corrected,
         alignment_table(result, residuals),
         result.frames.undetermined + result.setup.sightings.notes, result)
 
@@ -163,7 +167,7 @@ class MotionSolution:
             tangent plane, which are great circles; their errors grow away
             from the epochs observed, as the correlations say.
         """
-        return star_table(self._fit, float(julian_years(time)))
+        return _stars_at(self._fit, float(julian_years(time)))
 
     def covariance(self, ids):
         """
@@ -239,14 +243,13 @@ class MotionSolution:
         Parameters
         ----------
         ax : `~matplotlib.axes.Axes`
-            Where to draw.
+            Where to draw, and what is returned.
         epoch : int
             Number of the epoch, from 0.
 
         Returns
         -------
         `~matplotlib.axes.Axes`
-            The same.
         """
         from photutils_mgauss.plotting import plot_residual_vectors
         return plot_residual_vectors(ax, self, epoch)
@@ -258,12 +261,11 @@ class MotionSolution:
         Parameters
         ----------
         ax : `~matplotlib.axes.Axes`
-            Where to draw.
+            Where to draw, and what is returned.
 
         Returns
         -------
         `~matplotlib.axes.Axes`
-            The same.
         """
         from photutils_mgauss.plotting import plot_proper_motions
         return plot_proper_motions(ax, self.stars)
@@ -284,7 +286,12 @@ class MotionSolution:
         `~astropy.table.QTable`
             With the rows and columns of ``stars``.
         """
-        return star_table(measured_alone(self._fit), self._year)
+        return _stars_at(measured_alone(self._fit), self._year)
+
+
+def _stars_at(result, year):
+    """Return the table of a fit's stars at a Julian year."""
+    return star_table(result, year, propagated(result, year))
 
 
 def _numbers_of(ids, names):
