@@ -38,7 +38,11 @@ from numpy.polynomial import chebyshev, polynomial
 from photutils_mgauss.simulation.instrument import Band
 from photutils_mgauss.simulation.mock_psf import band_of
 from photutils_mgauss.sky.observers import add_aberration
-from photutils_mgauss.sky.tangent_plane import directions
+from photutils_mgauss.sky.tangent_plane import (
+    directions,
+    local_axes,
+    unit_vectors,
+)
 from photutils_mgauss.utils.validation import as_floats, as_real
 
 _LIGHT_SPEED = 299792.458 * u.km / u.s
@@ -63,13 +67,8 @@ NGP = (192.8595, 27.1283)  # the field of the paper [deg]
 
 def source_vectors(sources, time):
     """Return the geocentric directions (3, n) of sources at a time."""
-    ra, dec = (np.radians(_degrees(sources, name)) for name in ('ra', 'dec'))
-    zero = np.zeros_like(ra)
-    radial = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra),
-                       np.sin(dec)])
-    east = np.stack([-np.sin(ra), np.cos(ra), zero])
-    north = np.stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra),
-                      np.cos(dec)])
+    radial = unit_vectors(*(_degrees(sources, name) for name in ('ra', 'dec')))
+    east, north = local_axes(radial)
     earth = earth_at(time)[0]
     years = (time.tdb.jyear - _column(sources, 'ref_epoch', u.yr, 2016.0)
              + earth @ radial * _LIGHT_YEARS)
