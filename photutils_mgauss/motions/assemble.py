@@ -3,6 +3,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from astropy.table import Table
+from astropy.time import Time
 
 from photutils_mgauss.motions.epoch import check_epochs, read_epochs
 from photutils_mgauss.motions.matching import (
@@ -17,7 +18,7 @@ from photutils_mgauss.motions.references import (
     read_catalogue,
 )
 from photutils_mgauss.motions.ties import Ties, tie_planes
-from photutils_mgauss.sky.observers import observer_positions
+from photutils_mgauss.sky.observers import observer_positions, tdb
 from photutils_mgauss.sky.tangent_plane import TangentPlane
 
 COMMON = 0.5   # part of an epoch's stars in another one, if all is well
@@ -46,6 +47,8 @@ class Sightings:
         Julian years (TDB).
     epoch_years : (E,) `~numpy.ndarray`
         Mean Julian year of each epoch.
+    times : `~astropy.time.Time`
+        The same as times.
     observer : (3, E, 1) or (3, E, n) `~numpy.ndarray` or None
         Barycentric places of the observers [au], None without a plane.
     usable : (E, n) bool `~numpy.ndarray`
@@ -70,6 +73,7 @@ class Sightings:
     covariance: np.ndarray
     years: np.ndarray
     epoch_years: np.ndarray
+    times: Time
     observer: np.ndarray | None
     usable: np.ndarray
     flux: np.ndarray
@@ -111,8 +115,8 @@ def assemble(epochs, references, how, transform):
     observer = None if plane is None else observer_positions(
         [epoch.observer for epoch in epochs], every.years)
     return Sightings(epochs, plane, unit, every.ids, matches, places,
-                     covariance, every.years, years, observer, every.usable,
-                     every.flux, ties, catalogue, stars,
+                     covariance, every.years, years, tdb(years), observer,
+                     every.usable, every.flux, ties, catalogue, stars,
                      _few_in_common(matches.seen))
 
 

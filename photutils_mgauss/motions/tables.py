@@ -7,7 +7,6 @@ from photutils_mgauss.motions.joint import solve_all
 from photutils_mgauss.motions.loop import measured
 from photutils_mgauss.motions.propagation import FROM_OURS
 from photutils_mgauss.motions.stacked import invert_2x2
-from photutils_mgauss.sky.observers import tdb
 from photutils_mgauss.sky.tangent_plane import directions
 
 # What each bit of a star's flags means.
@@ -239,7 +238,7 @@ def alignment_table(fit, wcs_residuals):
     counts = _counts(fit)
     table = QTable()
     table['epoch'] = np.arange(len(state.maps))
-    table['time'] = tdb(sightings.epoch_years)
+    table['time'] = sightings.times
     table['shift'] = np.array(shift) * unit
     table['shift_error'] = np.array(errors) * unit
     table['matrix'] = np.array(slope)
