@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from photutils_mgauss.cli.tools import whole_file
 from photutils_mgauss.field.fit import fit_mixture_field
 from photutils_mgauss.field.selection import select_psf_stars
-from photutils_mgauss.motions.fitter import Epoch, ProperMotionFitter
+from photutils_mgauss.motions import Epoch, ProperMotionFitter
 from photutils_mgauss.photometry.psf_photometry import MixturePSFPhotometry
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.simulation import (

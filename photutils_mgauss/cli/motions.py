@@ -200,7 +200,7 @@ def _wcs_of(options, i, record):
 
 def _epoch(options, path, table, wcs, time):
     """Return the `Epoch` of a table, its flagged rows left out."""
-    from photutils_mgauss.motions.fitter import Epoch
+    from photutils_mgauss.motions import Epoch
     if time is None and 'time' not in table.colnames:
         raise ValueError(_no_time(path))
     table = _usable(table, options.good_flags)
@@ -247,7 +247,7 @@ def _no_time(path):
 def _fit(epochs, options):
     import astropy.units as u
 
-    from photutils_mgauss.motions.fitter import ProperMotionFitter
+    from photutils_mgauss.motions import ProperMotionFitter
     radius = options.match_radius
     fitter = ProperMotionFitter(
         transform=options.transform, recipe=options.recipe,

@@ -6,6 +6,8 @@ import numpy as np
 from astropy.table import QTable
 from scipy.spatial import cKDTree
 
+from photutils_mgauss.utils.robust import std_about_zero
+
 
 @dataclass(frozen=True)
 class InjectionResult:
@@ -130,6 +132,6 @@ def _median(values):
 
 
 def _scatter(values):
-    """Return 1.4826 times the median absolute value."""
+    """Return the standard deviation about zero, from the median size."""
     values = values[np.isfinite(values)]
-    return 1.4826 * _median(np.abs(values))
+    return float(std_about_zero(values)) if values.size else np.nan

@@ -204,7 +204,7 @@ def _odd_shape(core, candidates):
     if candidates.sum() < 5:
         return np.zeros(core.size, bool)
     middle = np.median(core[candidates])
-    scatter = 1.4826 * np.median(np.abs(core[candidates] - middle))
+    scatter = mad_std(core[candidates])
     limit = max(_SHAPE_LIMIT * scatter, _SHAPE_SHARE * middle)
     return np.abs(core - middle) > limit
 

@@ -6,6 +6,7 @@ Nothing here knows of images or tables; see `photutils_mgauss.field`.
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from astropy.stats import mad_std
 
 from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.normal import (
@@ -16,6 +17,7 @@ from photutils_mgauss.field.normal import (
     optimise,
     to_vector,
 )
+from photutils_mgauss.utils.robust import std_about_zero
 
 # Stars used while the degree is low: enough for its few coefficients.
 _START_STARS = 40
@@ -199,7 +201,7 @@ def _accuracy(residual, light, variance, problem):
     excess = np.sum(w * (residual**2 - variance)[problem.used], axis=(1, 2))
     squares = excess / np.maximum(np.sum(w**2, axis=(1, 2)), 1e-300)
     middle = np.median(squares)
-    scatter = 1.4826 * np.median(np.abs(squares - middle))
+    scatter = mad_std(squares)
     return np.sqrt(max(middle - 2.5 * scatter / np.sqrt(len(squares)), 0))
 
 
@@ -232,8 +234,7 @@ def _deviant_pixels(pulls, used):
     """
     columns = np.isfinite(pulls[used]).any(axis=0)
     typical = np.ones(columns.shape)
-    typical[columns] = 1.4826 * np.nanmedian(np.abs(pulls[used][:, columns]),
-                                             axis=0)
+    typical[columns] = std_about_zero(pulls[used][:, columns], axis=0)
     limit = _PIXEL_LIMIT * np.maximum(typical, 1)
     return np.abs(np.nan_to_num(pulls)) > limit
 
@@ -241,7 +242,7 @@ def _deviant_pixels(pulls, used):
 def not_deviant(reduced, used):
     """Return which stars' reduced chi^2 is like that of the used ones."""
     middle = np.median(reduced[used])
-    scatter = 1.4826 * np.median(np.abs(reduced[used] - middle))
+    scatter = mad_std(reduced[used])
     limit = middle + max(_STAR_LIMIT * scatter, _STAR_EXCESS * middle)
     return reduced <= limit
 

@@ -1,21 +1,25 @@
 """
 Proper motions from the catalogues of several epochs.
 
-An `epoch` is a table with its WCS, time and observer; `matching` finds the
-same star in several, `assemble` hands all of them over on one plane, with the
-`references` of a catalogue. `joint` solves for all stars and frames at once,
-`frames` and `relative` for what ties epochs together, and `loop` solves,
-judges and rejects until nothing changes. `fitter` has `ProperMotionFitter`,
-`solution` what it returns, `tables` and `corrected_wcs` make its parts,
-`paper_recipe` is the recipe of the paper. Nothing here knows of pixels beyond
-a position and its covariance.
+`fitter` has `ProperMotionFitter`, which goes one way through the room. An
+`epoch` is a table with its WCS, time and observer; `assemble` hands over one
+finished `Sightings`: all epochs read, the same star found in several
+(`matching`), planes without WCS tied to the others (`ties`), and the
+reference objects of a catalogue (`references`). `prepare` makes of it what
+stays the same in a fit, with what is known beforehand (`priors`). `loop`
+solves, judges and rejects until nothing changes: a `problem` is solved for
+all stars and frames at once by `joint` and `frames`, `relative` fixes what
+nothing else does, `paper_recipe` is the recipe of the paper. `solution` is
+what comes back: its parts are `propagation`, `corrected_wcs`, `tables` and
+`bootstrap`. Nothing here knows of pixels beyond a position and its
+covariance.
 """
 from photutils_mgauss.utils.lazy import hand_on
 
 __getattr__, __dir__, __all__ = hand_on(__name__, {
-    'bootstrap_median': 'fitter',
-    'decode_motion_flags': 'fitter',
-    'Epoch': 'fitter',
-    'MotionSolution': 'fitter',
+    'bootstrap_median': 'bootstrap',
+    'decode_motion_flags': 'solution',
+    'Epoch': 'epoch',
+    'MotionSolution': 'solution',
     'ProperMotionFitter': 'fitter',
 })

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photutils_mgauss.motions.joint import eliminate, parts, scaled_rows
+from photutils_mgauss.motions.joint import eliminate, scaled_rows
+from photutils_mgauss.motions.problem import parts
 from photutils_mgauss.utils.validation import as_floats, as_integer
 
 BATCH = 500  # resamplings worked on at a time
@@ -104,15 +105,15 @@ def bootstrap_frames(fit, n_resamples, rng):
     problem = fit.problem.select(stars)
     basis = _determined(fit)
     matrices, rhs = _contributions(problem, basis)
-    scene = fit.scene
-    centre = np.reshape(scene.transform.centre, (2, 1))
-    at_centre = scene.transform.basis(centre)[:, 0]
+    setup = fit.setup
+    centre = np.reshape(setup.transform.centre, (2, 1))
+    at_centre = setup.transform.basis(centre)[:, 0]
     mean_motion = _mean_motion(fit, basis)
     shifts, motions = [], []
     for start in range(0, n_resamples, BATCH):
         n = min(BATCH, n_resamples - start)
         change = _resolve(matrices, rhs, _weights(rng, n, len(stars)))
-        full = (change @ basis.T).reshape(n, len(scene.dt), 2, -1)
+        full = (change @ basis.T).reshape(n, len(setup.dt), 2, -1)
         shifts.append(full @ at_centre)
         motions.append(change @ mean_motion.T)
     return FrameDraws(np.concatenate(shifts), np.concatenate(motions))
@@ -120,7 +121,7 @@ def bootstrap_frames(fit, n_resamples, rng):
 
 def _tying(fit):
     """Return the references if there are any, else all that tie frames."""
-    ties = fit.problem.ties & fit.scene.anchors
+    ties = fit.problem.ties & fit.setup.anchors
     ties[fit.state.dropped] = False
     return ties
 
@@ -185,7 +186,7 @@ def _resolve(matrices, rhs, weights):
 
 def _mean_motion(fit, basis):
     """Return what the maps (q,) add to the mean motion, (2, q)."""
-    others = np.flatnonzero(~fit.scene.anchors)
+    others = np.flatnonzero(~fit.setup.anchors)
     stars = others if len(others) else np.arange(fit.problem.n_stars)
     stars = stars[:: max(1, len(stars) // SAMPLE)]
     some = eliminate(fit.problem.select(stars))

@@ -11,14 +11,14 @@ import numpy as np
 from astropy.coordinates import CartesianRepresentation
 from astropy.table import Table
 
-from photutils_mgauss.motions.stacked import sandwich_2x2
+from photutils_mgauss.motions.stacked import is_definite_2x2, sandwich_2x2
 from photutils_mgauss.sky.observers import (
     _known_observer,
     julian_years,
     observer_velocity,
     remove_aberration,
 )
-from photutils_mgauss.sky.tangent_plane import unit_vectors
+from photutils_mgauss.sky.tangent_plane import TangentPlane, unit_vectors
 from photutils_mgauss.sky.wcs import (
     check_celestial,
     pixel_jacobian,
@@ -223,6 +223,9 @@ class Detections:
     """
     What an epoch says about each of its n rows, as plain arrays.
 
+    For n stars at E epochs the arrays have an axis of epochs before the
+    last, and ``ids`` (n,) are the names of the stars.
+
     ``plane`` (2, n) and ``covariance`` (3, n: xx, xy, yy) are in the frame's
     unit, mas or pixels. ``found`` says which positions are finite,
     ``usable`` which errors are good as well.
@@ -298,6 +301,81 @@ def pixels(epoch):
     return numbers(epoch.table, 'x', u.pix), numbers(epoch.table, 'y', u.pix)
 
 
+def check_epochs(epochs):
+    """Return the epochs as a list, or raise for what cannot be fitted."""
+    if isinstance(epochs, Epoch):
+        msg = 'epochs must be a sequence of Epoch, got a single one'
+        raise TypeError(msg)
+    epochs = list(epochs)
+    for epoch in epochs:
+        if not isinstance(epoch, Epoch):
+            msg = (f'epochs must be a sequence of Epoch, got '
+                   f'{type(epoch).__name__}')
+            raise TypeError(msg)
+    if len(epochs) < 2:
+        msg = f'epochs must be at least 2, got {len(epochs)}'
+        raise ValueError(msg)
+    years = [epoch.mean_year for epoch in epochs]
+    if max(years) - min(years) <= 0:
+        msg = (f'epochs must have a time baseline, got all '
+               f'{len(years)} at {years[0]:.6f}')
+        raise ValueError(msg)
+    return epochs
+
+
+def read_epochs(epochs, references=None):
+    """
+    Return what epochs say, in one plane.
+
+    Parameters
+    ----------
+    epochs : list of `Epoch`
+    references : `~astropy.table.Table`, optional
+        Reference objects, whose unit counts where nothing is on the sky.
+
+    Returns
+    -------
+    detections : list of `Detections`
+    plane : `~photutils_mgauss.sky.tangent_plane.TangentPlane` or None
+        None where nothing is known about the sky.
+    unit : {'mas', 'pix'}
+    """
+    vectors = [sky_vectors(epoch) if epoch.is_sky else None
+               for epoch in epochs]
+    plane = _common_plane(vectors)
+    unit = 'mas' if plane else _common_unit(epochs, references)
+    # Popped, so that a million directions are kept no longer than needed.
+    detections = [read_epoch(epoch, plane, vectors.pop(0))
+                  for epoch in epochs]
+    return detections, plane, unit
+
+
+def _common_plane(vectors):
+    """Return the plane at the mean direction, None if there is no sky."""
+    seen = [vector for vector in vectors if vector is not None]
+    if not seen:
+        return None
+    total = sum(np.nansum(vector, axis=1) for vector in seen)
+    if not total.any():
+        msg = ('epochs must have finite positions, got none inside the '
+               'bounding boxes of their WCS')
+        raise ValueError(msg)
+    return TangentPlane.around(total)
+
+
+def _common_unit(epochs, references):
+    if references is not None and 'x' in references.colnames:
+        unit = getattr(references['x'], 'unit', None)
+        if unit is not None and unit.physical_type == 'angle':
+            return 'mas'
+    units = {plane_unit(epoch) for epoch in epochs}
+    if len(units) > 1:
+        msg = ('epochs must all have a scale or none, got columns in '
+               'pixels and in angles; give pixel_scale')
+        raise ValueError(msg)
+    return units.pop()
+
+
 def read_epoch(epoch, plane=None, vectors=None):
     """
     Return the `Detections` of an epoch.
@@ -305,18 +383,17 @@ def read_epoch(epoch, plane=None, vectors=None):
     ``plane`` is the common `TangentPlane`, and ``vectors`` the directions
     already computed; both None where nothing is known about the sky.
     """
+    ids, flux = _ids(epoch.table), _flux(epoch.table)
+    years = np.asarray(epoch.years, dtype=float)
     if vectors is None:
         positions, covariance = _read_plane(epoch)
     else:
         positions = plane.project(vectors)
         covariance = _sky_covariance(epoch, plane, positions)
-    found = np.isfinite(positions).all(axis=0)
-    years = np.asarray(epoch.years, dtype=float)
-    found &= np.isfinite(years)
-    positions = np.where(found, positions, np.nan)
-    usable = found & _positive_definite(covariance)
-    return Detections(_ids(epoch.table), positions, covariance, years,
-                      _flux(epoch.table), found, usable)
+    found = np.isfinite(positions).all(axis=0) & np.isfinite(years)
+    return Detections(ids, np.where(found, positions, np.nan), covariance,
+                      years, flux, found,
+                      found & is_definite_2x2(covariance))
 
 
 def _read_plane(epoch):
@@ -342,24 +419,16 @@ def _covariance(table, dx, dy, scale=1.0, unit=u.pix**2):
 
 def _sky_covariance(epoch, plane, positions):
     """Carry the errors of pixels or sky positions to the plane."""
+    keys, unit = (('x_err', 'y_err'), u.pix) if epoch.is_pixels else (
+        ('ra_err', 'dec_err'), u.mas)
+    errors = (numbers(epoch.table, key, unit) for key in keys)
+    covariance = _covariance(epoch.table, *errors, unit=unit**2)
     if epoch.is_pixels:
         x, y = pixels(epoch)
-        errors = (numbers(epoch.table, key, u.pix)
-                  for key in ('x_err', 'y_err'))
-        covariance = _covariance(epoch.table, *errors)
         jacobian = pixel_jacobian(epoch.wcs, plane, x, y)
     else:
-        errors = (numbers(epoch.table, key, u.mas)
-                  for key in ('ra_err', 'dec_err'))
-        covariance = _covariance(epoch.table, *errors, unit=u.mas**2)
         jacobian = plane.local_jacobian(positions)
     return sandwich_2x2(jacobian, covariance)
-
-
-def _positive_definite(covariance):
-    xx, xy, yy = covariance
-    with np.errstate(invalid='ignore'):
-        return (xx > 0) & (yy > 0) & (xx * yy - xy * xy > 1e-12 * xx * yy)
 
 
 def _ids(table):

@@ -4,339 +4,20 @@ Proper motions from tables of several epochs, and frames that fit together.
 Nie et al., Section 4.2 (``recipe='paper'``), and a joint solution of all
 stars and all frames with exact covariances (``recipe='joint'``).
 """
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import SkyCoord
-from astropy.table import QTable
 
-from photutils_mgauss.motions.assemble import (
-    assemble,
-    check_epochs,
-    few_in_common,
-    tie_planes,
-)
-from photutils_mgauss.motions.bootstrap import (
-    bootstrap_frames,
-    bootstrap_median,
-)
-from photutils_mgauss.motions.corrected_wcs import Correction, correct_epoch
-from photutils_mgauss.motions.epoch import Epoch
-from photutils_mgauss.motions.joint import Priors, solve_all
-from photutils_mgauss.motions.loop import Fit, Options, fit, prepare
-from photutils_mgauss.motions.matching import Tolerance
+from photutils_mgauss.motions.assemble import assemble
+from photutils_mgauss.motions.loop import fit
+from photutils_mgauss.motions.matching import HowToMatch
 from photutils_mgauss.motions.paper_recipe import fit_paper
-from photutils_mgauss.motions.tables import (
-    FLAGS,
-    alignment_table,
-    residual_table,
-    star_covariance,
-    star_table,
-    validation_table,
-)
-from photutils_mgauss.sky.observers import julian_years, observer_velocity, tdb
+from photutils_mgauss.motions.prepare import Options, prepare
+from photutils_mgauss.motions.solution import solution_of
+from photutils_mgauss.sky.observers import julian_years
 from photutils_mgauss.sky.transforms import Transform
-from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
-
-__all__ = ['Epoch', 'MotionSolution', 'ProperMotionFitter',
-           'bootstrap_median', 'decode_motion_flags']
+from photutils_mgauss.utils.validation import as_choice, as_real
 
 RECIPES = ('joint', 'two-step', 'paper')
-POINTING = 2000.0  # mas: offsets of exposures that are looked for
-
-
-@dataclass(frozen=True)
-class Match:
-    """How epochs are matched; see `ProperMotionFitter`."""
-
-    by: str
-    radius: u.Quantity | None
-    max_motion: u.Quantity
-
-    def tolerance(self, unit):
-        """Return the `Tolerance` in the units of a frame."""
-        radius = None
-        if self.radius is not None:
-            radius = self.radius.to_value(u.Unit(unit))
-        if unit == 'pix':
-            return Tolerance(radius, 0.0, 20 * (radius or 0.0))
-        pointing = POINTING if radius is None else max(POINTING, 2 * radius)
-        return Tolerance(radius, self.max_motion.to_value(u.mas / u.yr),
-                         pointing)
-
-
-def decode_motion_flags(flags):
-    """
-    Return the sentences the flags of a star stand for.
-
-    Parameters
-    ----------
-    flags : int
-        A value of the column ``flags`` of `MotionSolution.stars`.
-
-    Returns
-    -------
-    list of str
-
-    Examples
-    --------
-    >>> from photutils_mgauss import decode_motion_flags
-    >>> decode_motion_flags(8)
-    ['outlier: a detection was rejected as an outlier']
-    """
-    return [sentence for bit, sentence in FLAGS.items()
-            if int(flags) & bit]
-
-
-@dataclass(frozen=True, eq=False)
-class MotionSolution:
-    """
-    Proper motions, and the frames they were measured in.
-
-    Parameters
-    ----------
-    stars : `~astropy.table.QTable`
-        One row per star, with the Gaia catalogue's column names: ``ra``,
-        ``dec`` [deg] (``x``, ``y`` for planes without sky), ``parallax``
-        [mas], ``pmra`` (with the cosine of the declination in it) and
-        ``pmdec`` [mas / yr], an ``_error`` for each, the ten ``_corr``,
-        ``ref_epoch`` (Julian year, TDB), ``n_obs``, ``n_good_obs``,
-        ``visibility_periods_used``, ``chi2``, ``dof``, ``uwe``, ``flags``
-        (see `decode_motion_flags`).
-    epochs : list of `Epoch`
-        The epochs given, with corrected WCS.
-    alignment : `~astropy.table.QTable`
-        One row per epoch: the map's shift and matrix, its coefficients,
-        the references used and rejected, the rms of their residuals, and
-        the systematic error found.
-    notes : tuple of str
-        What the data could not determine, and which epochs have few stars
-        in common with the others, in sentences.
-
-    Examples
-    --------
-    >>> from photutils_mgauss import (
-    ...     Epoch, Instrument, ProperMotionFitter, paper_exposures,
-    ...     simulate_catalogues, sky_field)
-    >>> sources = sky_field(30, 20, size=0.3, magnitudes=(20, 23),
-    ...                     parallaxes=False, separation=0.5, rng=1)
-    >>> epochs = [Epoch(one.table, one.wcs, one.time)
-    ...           for one in simulate_catalogues(
-    ...               sources, paper_exposures()[::3], rng=2,
-    ...               instrument=Instrument(shape=(400, 400)))]
-    >>> quasars = list(sources['id'][sources['kind'] == 'qso'])
-    >>> solution = ProperMotionFitter(references=quasars).fit(epochs)
-    >>> solution
-    <MotionSolution: 50 of 50 stars, 3 epochs>
-    >>> solution.stars['pmra', 'pmra_error', 'pmra_pmdec_corr'].colnames
-    ['pmra', 'pmra_error', 'pmra_pmdec_corr']
-    >>> solution.residuals['epoch', 'dra', 'ddec'].colnames
-    ['epoch', 'dra', 'ddec']
-
-    Positions at another time, with the errors of then:
-
-    >>> later = solution.at(2030.0)
-    >>> bool((later['ra_error'] > solution.stars['ra_error']).all())
-    True
-    """
-
-    stars: QTable
-    epochs: list
-    alignment: QTable
-    notes: tuple
-    _fit: Fit = field(repr=False)
-
-    def __repr__(self):
-        solved = int(np.isfinite(self.stars['pmra']).sum())
-        return (f'<MotionSolution: {solved} of {len(self.stars)} stars, '
-                f'{len(self.epochs)} epochs>')
-
-    @cached_property
-    def residuals(self):
-        """
-        One row per detection, as a `~astropy.table.QTable`.
-
-        The aligned position, its residual towards east and north, what the
-        residual would be had the detection not been used, and its
-        chi-square (of two degrees of freedom, leverage taken into account).
-        """
-        return residual_table(self._fit)
-
-
-    @property
-    def sky(self):
-        """
-        The stars as a `~astropy.coordinates.SkyCoord` with motions.
-
-        ICRS, at the reference epoch; None for planes without sky.
-        """
-        if 'ra' not in self.stars.colnames:
-            return None
-        return SkyCoord(self.stars['ra'], self.stars['dec'],
-                        pm_ra_cosdec=self.stars['pmra'],
-                        pm_dec=self.stars['pmdec'], frame='icrs',
-                        obstime=tdb(self.stars['ref_epoch'][0].value))
-
-    def at(self, time):
-        """
-        Return the stars at another epoch, with the covariances of then.
-
-        Parameters
-        ----------
-        time : `~astropy.time.Time` or float
-            The new reference epoch.
-
-        Returns
-        -------
-        `~astropy.table.QTable`
-            Like ``stars``. Positions move along straight lines on the
-            tangent plane, which are great circles; their errors grow away
-            from the epochs observed, as the correlations say.
-        """
-        return star_table(self._fit, float(julian_years(time)))
-
-    def covariance(self, ids):
-        """
-        Return the covariances within and between some stars.
-
-        Parameters
-        ----------
-        ids : (k,) array_like
-            Identifiers of at most some hundred stars.
-
-        Returns
-        -------
-        (k, p, k, p) `~numpy.ndarray`
-            For the p parameters ``ra``, ``dec``, ``parallax`` (if fitted),
-            ``pmra`` and ``pmdec`` at the reference epoch [mas, mas / yr].
-            What two stars share is the error of the frames.
-
-        Raises
-        ------
-        ValueError
-            If a star is unknown, or motions are relative.
-        """
-        if self._fit.scene.relative:
-            msg = ('references must be given for covariances between '
-                   'stars, got relative motions')
-            raise ValueError(msg)
-        stars = _numbers_of(np.atleast_1d(ids), self.stars['id'])
-        return star_covariance(self._fit, stars, self._year)
-
-    def validation(self):
-        """
-        Compare the references held out with their catalogue.
-
-        Returns
-        -------
-        `~astropy.table.QTable`
-            ``id``, ``dpmra`` and ``dpmdec`` (measured minus catalogue),
-            their errors, those of the catalogue included, and ``chi2`` of
-            two degrees of freedom.
-        """
-        return validation_table(self._fit, self.stars)
-
-    def bootstrap(self, n_resamples=10000, *, rng=None):
-        """
-        Resample the reference objects to see the error of the frames.
-
-        Parameters
-        ----------
-        n_resamples : int, optional
-            Number of resamplings.
-        rng : `~numpy.random.Generator` or int, optional
-            Source of the random draws.
-
-        Returns
-        -------
-        draws : object
-            ``draws.shift`` (n_resamples, E, 2) is the change of each map
-            at the centre of the field [mas], ``draws.motion``
-            (n_resamples, 2) that of all motions in common [mas / yr].
-
-        Raises
-        ------
-        TypeError, ValueError
-            If ``n_resamples`` is not a positive integer.
-        """
-        n = as_integer(n_resamples, 'n_resamples', minimum=1)
-        return bootstrap_frames(self._fit, n, rng)
-
-    def plot_residuals(self, ax, epoch):
-        """
-        Draw the residuals of one epoch as arrows.
-
-        Parameters
-        ----------
-        ax : `~matplotlib.axes.Axes`
-            Where to draw.
-        epoch : int
-            Number of the epoch, from 0.
-
-        Returns
-        -------
-        `~matplotlib.axes.Axes`
-            The same.
-        """
-        from photutils_mgauss.plotting import plot_residual_vectors
-        return plot_residual_vectors(ax, self, epoch)
-
-    def plot_motions(self, ax):
-        """
-        Plot the proper-motion diagram.
-
-        Parameters
-        ----------
-        ax : `~matplotlib.axes.Axes`
-            Where to draw.
-
-        Returns
-        -------
-        `~matplotlib.axes.Axes`
-            The same.
-        """
-        from photutils_mgauss.plotting import plot_proper_motions
-        return plot_proper_motions(ax, self.stars)
-
-    @property
-    def _year(self):
-        return float(self.stars['ref_epoch'][0].value)
-
-    def measured(self):
-        """
-        Return the stars as the detections alone have them.
-
-        The same table as ``stars``, in the same frames, but without what the
-        catalogue says of each reference object: for comparing the two.
-
-        Returns
-        -------
-        `~astropy.table.QTable`
-            With the rows and columns of ``stars``.
-        """
-        result = self._fit
-        if result.scene.relative:
-            return self.stars.copy()
-        alone = replace(result.problem,
-                        priors=Priors.none(result.problem.n_parameters))
-        estimates = solve_all(alone, result.frames.correction,
-                              result.frames.factor,
-                              result.scene.options.executor, residuals=True)
-        return star_table(replace(result, problem=alone,
-                                  estimates=estimates), self._year)
-
-
-def _numbers_of(ids, names):
-    """Return the rows of identifiers in a column."""
-    names = np.asarray(names)
-    missing = ~np.isin(ids, names)
-    if missing.any():
-        msg = f'ids must be those of stars, got {ids[missing][0]!r}'
-        raise ValueError(msg)
-    order = np.argsort(names)
-    return order[np.searchsorted(names, ids, sorter=order)]
 
 
 class ProperMotionFitter:
@@ -442,8 +123,8 @@ class ProperMotionFitter:
         self.acceleration = acceleration
         self.eps_t = eps_t
         self.rng = rng
-        self._options('mas')
-        self._match()
+        self._options()
+        self._how_to_match()
 
     def __repr__(self):
         return (f'ProperMotionFitter(transform={self.transform!r}, '
@@ -468,39 +149,28 @@ class ProperMotionFitter:
             If the epochs have no time baseline or no stars in common, or
             an epoch has fewer references than its map needs.
         """
-        epochs = check_epochs(epochs)
-        sightings = assemble(epochs, self.references, self._match())
-        options = self._options(sightings.unit)
-        sightings = tie_planes(sightings,
-                               [epoch.is_sky for epoch in epochs],
-                               options.transform)
-        scene, state = prepare(sightings, epochs, options)
-        if options.recipe == 'paper':
-            result = fit_paper(scene, state, self.eps_t)
-        else:
-            result = fit(scene, state)
-        return self._solution(epochs, result)
+        options = self._options()
+        sightings = assemble(epochs, self.references, self._how_to_match(),
+                             options.transform)
+        setup, state = prepare(sightings, options)
+        result = (fit(setup, state) if options.recipe != 'paper'
+                  else fit_paper(setup, state))
+        return solution_of(result, self._ref_year())
 
-    def _solution(self, epochs, result):
-        year = result.scene.working_year
-        if self.ref_epoch is not None:
-            year = as_real(julian_years(self.ref_epoch, 'ref_epoch'),
-                           'ref_epoch')
-        corrected, residuals = _corrected(epochs, result)
-        notes = (*result.frames.undetermined,
-                 *few_in_common(result.scene.sightings))
-        return MotionSolution(star_table(result, year), corrected,
-                              alignment_table(result, residuals), notes,
-                              result)
+    def _ref_year(self):
+        if self.ref_epoch is None:
+            return None
+        return as_real(julian_years(self.ref_epoch, 'ref_epoch'),
+                       'ref_epoch')
 
-    def _match(self):
+    def _how_to_match(self):
         as_choice(self.match_by, 'match_by', ('auto', 'id', 'sky'))
         _check_quantity(self.max_motion, 'max_motion', u.mas / u.yr)
         if self.match_radius is not None:
             _check_quantity(self.match_radius, 'match_radius', u.mas, u.pix)
-        return Match(self.match_by, self.match_radius, self.max_motion)
+        return HowToMatch(self.match_by, self.match_radius, self.max_motion)
 
-    def _options(self, unit):
+    def _options(self):
         as_choice(self.recipe, 'recipe', RECIPES)
         as_choice(self.eps_t, 'eps_t', ('printed', 'corrected'))
         if self.parallax not in (False, True, 'prior'):
@@ -518,24 +188,8 @@ class ProperMotionFitter:
             raise TypeError(msg)
         return Options(Transform.parse(self.transform), self.recipe,
                        self.parallax, tuple(prior), bool(self.acceleration),
-                       _systematic(self.systematic, unit), clip,
-                       self._match().tolerance(unit).max_motion, held,
-                       self.rng, self.executor)
-
-
-def _corrected(epochs, result):
-    """Return the epochs with corrected WCS, and the residuals of those."""
-    scene = result.scene
-    plane = scene.sightings.plane
-    if plane is None or scene.transform.kind == 'none':
-        return list(epochs), [np.nan] * len(epochs)
-    pairs = [correct_epoch(
-        epoch, Correction(plane, scene.transform, coefficients,
-                          observer_velocity(epoch.observer)), tie)
-             for epoch, coefficients, tie in zip(
-                 epochs, result.state.maps, scene.sightings.ties,
-                 strict=True)]
-    return tuple(list(some) for some in zip(*pairs, strict=True))
+                       _systematic(self.systematic), clip, self.max_motion,
+                       held, self.eps_t, self.rng, self.executor)
 
 
 def _check_quantity(value, name, *units):
@@ -550,10 +204,9 @@ def _check_quantity(value, name, *units):
     return value
 
 
-def _systematic(value, unit):
+def _systematic(value):
     if value is None:
-        return 0.0
+        return None
     if isinstance(value, str):
         return as_choice(value, 'systematic', ('fit',))
-    return _check_quantity(value, 'systematic', u.mas,
-                           u.pix).to_value(u.Unit(unit))
+    return _check_quantity(value, 'systematic', u.mas, u.pix)

@@ -3,17 +3,12 @@ Frames tied to one another: the maps, what fixes them, what leaves them open.
 
 A frame is one epoch's map onto the common plane. Given the stars' reduced
 equations (see ``joint``) this module finds the maps, says in words which
-combinations of them nothing determines, and judges each detection.
+combinations of them nothing determines.
 """
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri, ndtr
 
-from photutils_mgauss.motions.stacked import invert_2x2
-from photutils_mgauss.sky.transforms import Transform, fit_map
-
-SIGNIFICANT = 2.0  # standard deviations that call for a floor
 NULL = 1e-10  # relative to the information before stars are eliminated
 
 
@@ -69,22 +64,22 @@ class Gauge:
     parallaxes: np.ndarray
 
     @classmethod
-    def of(cls, transform, dt, parallax_factors=None, acceleration=False):
-        """
-        Return the gauge of E frames at times ``dt`` (E,).
-
-        ``parallax_factors`` (2, E) are those at the centre of the field.
-        """
+    def of(cls, problem):
+        """Return the gauge of the frames of a `MotionProblem`."""
+        transform, dt = problem.transform, problem.dt.mean(axis=1)
         generators = transform.generators
-        ones = np.ones_like(dt)
         motions = [np.kron(dt[:, None], generators)]
-        if acceleration:
+        if problem.acceleration:
             motions.append(np.kron(dt[:, None]**2 / 2, generators))
         parallaxes = np.empty((len(dt) * len(generators), 0))
-        if parallax_factors is not None:
-            parallaxes = _parallax_family(transform, parallax_factors)
-        return cls(np.kron(ones[:, None], generators), np.hstack(motions),
-                   parallaxes)
+        if problem.observer is not None:
+            # The parallax factors (2, E) at the centre of the field.
+            parallaxes = _parallax_family(
+                transform, problem.plane.parallax_factors(
+                    np.array(transform.centre)[:, None],
+                    problem.observer.mean(axis=2)))
+        return cls(np.kron(np.ones((len(dt), 1)), generators),
+                   np.hstack(motions), parallaxes)
 
 
 def _parallax_family(transform, factors):
@@ -98,14 +93,15 @@ def _parallax_family(transform, factors):
     return family[:, allowed]
 
 
-def solve_frames(reduced, transform, gauge, *, relative=False):
+def solve_frames(problem, reduced, *, relative=False):
     """
-    Return the `Frames` of reduced equations.
+    Return the `Frames` of a problem from its `Reduced` equations.
 
     What the data do not determine stays as it is. With ``relative=True`` the
     stars themselves are the reference: common motions and parallaxes are
     left alone even where rows of different times seem to determine them.
     """
+    transform = problem.transform
     n_epochs, size, _ = reduced.direct.shape
     shape = (n_epochs, 2, size // 2)
     if transform.n_parameters == 0:
@@ -115,6 +111,7 @@ def solve_frames(reduced, transform, gauge, *, relative=False):
     information = np.einsum('ij,ij->j', free,
                             _blocks_times(reduced.direct, free))
     scale = 1 / np.sqrt(np.where(information > 0, information, 1))
+    gauge = Gauge.of(problem)
     matrix = matrix * np.outer(scale, scale)
     basis, null = _split(matrix, information, _forced(
         gauge, free, scale) if relative else None)
@@ -187,91 +184,3 @@ def _sentences(null, gauge, free, scale, transform):
     if null.shape[1] > explained:
         said.append(OTHERS.format(n=null.shape[1] - explained))
     return tuple(said)
-
-
-def tie_plane(points, targets, weights, kind):
-    """
-    Return the map (2, 3) of a plane without WCS onto the common one.
-
-    ``kind`` is the `Transform`; polynomials start from an affine map.
-    """
-    if kind.kind == 'polynomial':
-        kind = Transform('affine')
-    kind = kind.fitted_to(points)
-    coefficients = fit_map(kind, points, targets, weights)
-    slope = coefficients[:, 1:3] / kind.scale
-    start = coefficients[:, 0] - slope @ np.array(kind.centre)
-    return np.column_stack([start, slope])
-
-
-def chi2_limit(clip, dof):
-    """Return the chi-square as rare as a deviation by ``clip`` sigma."""
-    return chdtri(dof, 2 * ndtr(-clip))
-
-
-def worst_outliers(chi2, used, spare, clip):
-    """
-    Return which detections to reject now, (E, n): each star's worst.
-
-    Only one of a star's goes at a time, because a bad one spoils the
-    residuals of the good; and only where ``spare`` (n,) says the star has
-    detections enough to tell the bad one.
-    """
-    limit = chi2_limit(clip, 2)
-    chi2 = np.where(used, np.nan_to_num(chi2, nan=0.0), 0.0)
-    worst = chi2.argmax(axis=0)
-    out = np.zeros(used.shape, dtype=bool)
-    stars = np.arange(used.shape[1])
-    out[worst, stars] = (chi2[worst, stars] > limit) & spare
-    return out
-
-
-def floor_variance(residuals, covariance, expected, floor, *,
-                   robust=False):
-    r"""
-    Return the variance per axis that makes one epoch's chi-square expected.
-
-    Parameters
-    ----------
-    residuals : (2, n) `~numpy.ndarray`
-    covariance : (3, n) `~numpy.ndarray`
-        Covariances of the measurements without the floor.
-    expected : (n,) `~numpy.ndarray`
-        Expected chi-square of each, 2 minus its leverage.
-    floor : float
-        The present variance.
-    robust : bool, optional
-        Make the median of the chi-squares the expected one instead of their
-        sum, for data with outliers.
-
-    Notes
-    -----
-    Solves :math:`\sum r^T (\Sigma + s I)^{-1} r = \sum (2 - h)` for s by
-    bisection in a safe bracket; 0 where the errors explain the residuals.
-    """
-    good = np.isfinite(residuals).all(axis=0) & np.isfinite(expected)
-    good &= expected > 0.1
-    residuals, covariance = residuals[:, good], covariance[:, good]
-    expected = expected[good]
-    if expected.sum() < 4:
-        return 0.0
-
-    def excess(variance):
-        xx, xy, yy = covariance
-        a, b, c = invert_2x2(xx + variance, xy, yy + variance)
-        x, y = residuals
-        chi2 = a * x * x + 2 * b * x * y + c * y * y
-        if robust:
-            return np.median(chi2 / expected) - np.log(2)
-        return chi2.sum() - expected.sum()
-    # An excess that good errors alone would show every twentieth time is
-    # not worth a floor, which would only make all errors too large.
-    noise = (1 / np.sqrt(len(expected)) if robust
-             else np.sqrt(2 * expected.sum()))
-    low, high = 0.0, max(floor, np.max(residuals**2), 1e-30)
-    if excess(0.0) <= SIGNIFICANT * noise:
-        return 0.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
-    return (low + high) / 2

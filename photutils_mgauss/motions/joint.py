@@ -31,13 +31,15 @@ evaluated at the mean place of a star, not at each measured one: the two agree
 once the maps have converged, and only with a common basis are shifts of all
 frames together exactly undetermined, as they must be.
 """
-from dataclasses import dataclass, fields, replace
-from functools import reduce
+from dataclasses import dataclass, fields
+from functools import partial, reduce
 from operator import add
 
 import numpy as np
 
+from photutils_mgauss.motions.problem import parts
 from photutils_mgauss.motions.stacked import (
+    Summed,
     apply,
     apply_transposed,
     gram,
@@ -46,169 +48,9 @@ from photutils_mgauss.motions.stacked import (
 )
 from photutils_mgauss.utils.parallel import map_parallel
 
-CHUNK = 8192  # stars worked on at a time: what fits into a processor's cache
-
 
 @dataclass(frozen=True, eq=False)
-class Priors:
-    """
-    What is known of k of the stars beforehand, as normal equations.
-
-    Parameters
-    ----------
-    stars : (k,) int `~numpy.ndarray`
-        Sorted numbers of the stars.
-    precision : (p, p, k) `~numpy.ndarray`
-        Inverse covariance of the parameters, 0 where nothing is known.
-    moment : (p, k) `~numpy.ndarray`
-        The precision times the expected parameters, positions relative to
-        the star's origin. (The expected parameters themselves do not exist
-        where the precision is singular.)
-    constant : (k,) `~numpy.ndarray`
-        The chi-square of parameters that are all zero.
-    """
-
-    stars: np.ndarray
-    precision: np.ndarray
-    moment: np.ndarray
-    constant: np.ndarray
-
-    @classmethod
-    def none(cls, n_parameters):
-        """Return priors of no star at all."""
-        p = n_parameters
-        return cls(np.empty(0, dtype=int), np.empty((p, p, 0)),
-                   np.empty((p, 0)), np.empty(0))
-
-    def pick(self, which, stars=None):
-        """Return some of the priors, for ``stars`` or the same ones."""
-        stars = self.stars[which] if stars is None else stars
-        return Priors(stars, self.precision[..., which],
-                      self.moment[:, which], self.constant[which])
-
-    def chi2(self, values):
-        """Return the chi-square (k,) of parameters (p, n) of all stars."""
-        v = values[:, self.stars]
-        return (np.sum(v * (apply(self.precision, v) - 2 * self.moment),
-                       axis=0) + self.constant)
-
-    def between(self, start, stop):
-        """Return the priors of stars start <= i < stop, renumbered."""
-        part = slice(*np.searchsorted(self.stars, [start, stop]))
-        return self.pick(part, self.stars[part] - start)
-
-    def without(self, stars):
-        """Return the priors of all stars but these."""
-        return self.pick(~np.isin(self.stars, stars))
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """
-    Aligned positions of n stars at E epochs, and the model for them.
-
-    Parameters
-    ----------
-    offsets : (2, E, n) `~numpy.ndarray`
-        Aligned positions minus ``origin``; 0 where there are none.
-    weights : (3, E, n) `~numpy.ndarray`
-        Elements xx, xy, yy of the inverse covariances; 0 where unused.
-    origin : (2, n) `~numpy.ndarray`
-        Mean places of the stars.
-    dt : (E, 1) or (E, n) `~numpy.ndarray`
-        Times since the working epoch [yr].
-    observer : (3, E, 1) or (3, E, n) `~numpy.ndarray` or None
-        Barycentric places of the observer [au], None without parallax.
-    plane : `~photutils_mgauss.sky.tangent_plane.TangentPlane` or None
-    transform : `~photutils_mgauss.sky.transforms.Transform`
-    priors : `Priors`
-    acceleration : bool
-    ties : (n,) bool `~numpy.ndarray`
-        The stars that take part in finding the frames.
-    """
-
-    offsets: np.ndarray
-    weights: np.ndarray
-    origin: np.ndarray
-    dt: np.ndarray
-    observer: np.ndarray | None
-    plane: object
-    transform: object
-    priors: Priors
-    acceleration: bool
-    ties: np.ndarray
-
-    @property
-    def n_parameters(self):
-        """Number of parameters of a star."""
-        return 4 + (self.observer is not None) + 2 * self.acceleration
-
-    @property
-    def n_stars(self):
-        """Number of stars."""
-        return self.origin.shape[1]
-
-    @property
-    def n_epochs(self):
-        """Number of epochs."""
-        return self.offsets.shape[1]
-
-    def part(self, start, stop):
-        """Return the problem of stars start <= i < stop alone."""
-        part = slice(start, stop)
-        per_row = self.dt.shape[1] > 1
-        observer = self.observer
-        if observer is not None and observer.shape[2] > 1:
-            observer = observer[..., part]
-        return replace(
-            self, offsets=self.offsets[..., part],
-            weights=self.weights[..., part], origin=self.origin[:, part],
-            dt=self.dt[:, part] if per_row else self.dt, observer=observer,
-            priors=self.priors.between(start, stop), ties=self.ties[part])
-
-    def select(self, stars):
-        """Return the problem of the given stars alone."""
-        stars = np.asarray(stars)
-        observer = self.observer
-        if observer is not None and observer.shape[2] > 1:
-            observer = observer[..., stars]
-        place = np.full(self.n_stars, -1)
-        place[stars] = np.arange(len(stars))
-        found = place[self.priors.stars]
-        which = np.argsort(found)[np.sum(found < 0):]
-        priors = self.priors.pick(which, found[which])
-        return replace(
-            self, offsets=self.offsets[..., stars],
-            weights=self.weights[..., stars], origin=self.origin[:, stars],
-            dt=self.dt[:, stars] if self.dt.shape[1] > 1 else self.dt,
-            observer=observer, priors=priors, ties=self.ties[stars])
-
-    def columns(self):
-        """
-        Return the design matrix D as p pairs of its x and y row.
-
-        Each is (E, 1) or (E, n); None stands for zeros.
-        """
-        one = np.ones((self.n_epochs, 1))
-        columns = [(one, None), (None, one), (self.dt, None),
-                   (None, self.dt)]
-        if self.observer is not None:
-            columns.append(tuple(self.plane.parallax_factors(
-                self.origin[:, None, :], self.observer)))
-        if self.acceleration:
-            half = self.dt**2 / 2
-            columns += [(half, None), (None, half)]
-        return columns
-
-
-def parts(problem):
-    """Yield the problem in parts that fit into a processor's cache."""
-    for start in range(0, problem.n_stars, CHUNK):
-        yield problem.part(start, min(start + CHUNK, problem.n_stars))
-
-
-@dataclass(frozen=True, eq=False)
-class Stars:
+class EliminatedStars:
     """
     Stars with the frames left open: the R, y and Z of the equations above.
 
@@ -230,7 +72,7 @@ class Stars:
 
 
 def eliminate(problem):
-    """Return the `Stars` of a problem."""
+    """Return the `EliminatedStars` of a problem."""
     columns = problem.columns()
     weighted = [_weigh(problem.weights, column) for column in columns]
     normal = _normal_matrices(columns, weighted, problem)
@@ -239,7 +81,7 @@ def eliminate(problem):
     _add_priors(problem.priors, normal, moment)
     factor, solved = inverse_factor(normal)
     basis = problem.transform.basis(problem.origin)
-    return Stars(columns, factor, apply(factor, moment),
+    return EliminatedStars(columns, factor, apply(factor, moment),
                  _combine(factor, weighted), basis, solved)
 
 
@@ -289,7 +131,7 @@ def _combine(factor, weighted):
 
 
 @dataclass(frozen=True, eq=False)
-class Reduced:
+class Reduced(Summed):
     """
     The frames' equations S r = rhs, and A^T W A before the elimination.
 
@@ -299,10 +141,6 @@ class Reduced:
     matrix: np.ndarray
     rhs: np.ndarray
     direct: np.ndarray
-
-    def __add__(self, other):
-        return Reduced(self.matrix + other.matrix, self.rhs + other.rhs,
-                       self.direct + other.direct)
 
 
 def reduce_stars(problem):
@@ -344,22 +182,14 @@ def _block_diagonal(blocks):
     return out.reshape(n * size, n * size)
 
 
+def each_part(function, problem, executor=None):
+    """Yield what a function returns for the parts of a problem, in order."""
+    return map_parallel(function, parts(problem), executor=executor)
+
+
 def reduce_all(problem, executor=None):
     """Return the `Reduced` equations of a whole problem."""
-    return reduce(add, map_parallel(reduce_stars, parts(problem),
-                                    executor=executor))
-
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """A part of a problem with the frames found, to solve its stars."""
-
-    problem: Problem
-    correction: np.ndarray  # (E, 2, b)
-    factor: np.ndarray      # (M, q), covariance of r is factor @ factor.T
-    residuals: bool = False
-    leverage: bool = False
-    judge: bool = False
+    return reduce(add, each_part(reduce_stars, problem, executor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,23 +217,23 @@ class Estimates:
     expected: np.ndarray | None = None
 
 
-def solve_stars(task):
-    """Return the `Estimates` of a part of the stars."""
-    stars = eliminate(task.problem)
-    scaled = scaled_rows(stars, task.factor)
-    shift = _shift(stars.basis, task.correction)
+def solve_stars(problem, correction, factor, *, residuals=False,
+                leverage=False, judge=False):
+    """Return the `Estimates` of a part of the stars; see `solve_all`."""
+    stars = eliminate(problem)
+    scaled = scaled_rows(stars, factor)
+    shift = _shift(stars.basis, correction)
     values, covariance = _estimate(stars, shift, scaled)
-    residuals = predicted = None
+    away = predicted = None
     judged = None, None, None
-    if task.residuals or task.judge:
-        residuals = _residuals(task.problem.offsets + shift, stars, values)
-    if task.leverage or task.judge:
-        predicted = _predicted(stars, task, scaled)
-    if task.judge:
-        judged = _judge(residuals, predicted, task.problem.weights)
-    return Estimates(values, covariance,
-                     residuals if task.residuals else None,
-                     predicted if task.leverage else None, *judged)
+    if residuals or judge:
+        away = _residuals(problem.offsets + shift, stars, values)
+    if leverage or judge:
+        predicted = _predicted(stars, problem, factor, scaled)
+    if judge:
+        judged = _judge(away, predicted, problem.weights)
+    return Estimates(values, covariance, away if residuals else None,
+                     predicted if leverage else None, *judged)
 
 
 def _residuals(offsets, stars, values):
@@ -460,16 +290,15 @@ def scaled_rows(stars, factor):
                      for k in range(len(stars.factor))])
 
 
-def _predicted(stars, task, scaled):
+def _predicted(stars, problem, factor, scaled):
     r"""
     Return the covariance of the fitted positions, (3, E, n).
 
     With :math:`U = D R^T Z - A` it is :math:`D H^{-1} D^T + U S^{-1} U^T`.
     """
-    n_epochs = task.problem.n_epochs
-    out = np.empty((3, *task.problem.offsets.shape[1:]))
-    blocks = task.factor.reshape(n_epochs, 2, len(stars.basis),
-                                 task.factor.shape[1])
+    n_epochs = problem.n_epochs
+    out = np.empty((3, *problem.offsets.shape[1:]))
+    blocks = factor.reshape(n_epochs, 2, len(stars.basis), factor.shape[1])
     for e in range(n_epochs):
         rows = [_project(stars, e, c) for c in range(2)]
         frame = [np.einsum('kn,knq->nq', rows[c], scaled)
@@ -493,12 +322,26 @@ def _project(stars, e, c):
     return out
 
 
-def solve_all(problem, correction, factor, executor=None, *,
-              residuals=False, leverage=False, judge=False):
-    """Return the `Estimates` of all stars of a problem."""
-    tasks = (Task(part, correction, factor, residuals, leverage, judge)
-             for part in parts(problem))
-    results = list(map_parallel(solve_stars, tasks, executor=executor))
+def solve_all(problem, correction, factor, executor=None, **wanted):
+    """
+    Return the `Estimates` of all stars of a problem with the frames found.
+
+    Parameters
+    ----------
+    problem : `~photutils_mgauss.motions.problem.MotionProblem`
+    correction : (E, 2, b) `~numpy.ndarray`
+        The correction r of the frames.
+    factor : (M, q) `~numpy.ndarray`
+        The covariance of r is ``factor @ factor.T``.
+    executor : `~concurrent.futures.Executor`, optional
+    **wanted
+        ``residuals``, ``leverage`` and ``judge``: whether to return the
+        residuals, what the fit took away of their covariance, and what the
+        detections are judged by.
+    """
+    solve = partial(solve_stars, correction=correction, factor=factor,
+                    **wanted)
+    results = list(each_part(solve, problem, executor))
     return Estimates(*(_join(results, field.name)
                        for field in fields(Estimates)))
 
@@ -510,11 +353,21 @@ def _join(results, name):
     return np.concatenate(arrays, axis=-1)
 
 
+def total_chi2(problem, estimates):
+    """Return the chi-square (n,) of detections and what was known before."""
+    x, y = estimates.residuals
+    xx, xy, yy = problem.weights
+    chi2 = np.sum(xx * x * x + 2 * xy * x * y + yy * y * y, axis=0)
+    priors = problem.priors
+    chi2[priors.stars] += priors.chi2(estimates.values)
+    return chi2
+
+
 def cross_covariance(problem, factor):
     r"""
     Return the covariance between all parameters of all stars.
 
-    Shape (n, p, n, p); meant for some hundred stars.
+    Shape (n, p, n, p), so for at most some hundred stars.
     """
     stars = eliminate(problem)
     n, p = problem.n_stars, problem.n_parameters
@@ -531,7 +384,7 @@ def cross_covariance(problem, factor):
     return out
 
 
-def parallax_leak(problem):
+def parallax_leak(problem, executor=None):
     r"""
     Return what a parallax does to motions fitted without one.
 
@@ -546,8 +399,16 @@ def parallax_leak(problem):
     correlation : (2, n) `~numpy.ndarray`
         Of parallax and motion, if both were fitted.
     leak : (2, n) `~numpy.ndarray`
-        Bias of the motion for one unit of parallax [1 / yr].
+        Bias of the motion for one unit of parallax [1 / yr], in local axes.
     """
+    leaks = each_part(_leak, problem, executor)
+    correlation, leak = (np.concatenate(some, axis=-1)
+                         for some in zip(*leaks, strict=True))
+    return correlation, leak
+
+
+def _leak(problem):
+    """Return the correlation and leak of a part of the stars."""
     columns = problem.columns()[:5]
     weighted = [_weigh(problem.weights, column) for column in columns]
     normal = _normal_matrices(columns, weighted, problem)
@@ -562,4 +423,5 @@ def parallax_leak(problem):
         correlation = -motion / np.sqrt(corner * variance + motion**2)
     correlation[:, ~solved] = np.nan
     motion[:, ~solved] = np.nan
-    return correlation, motion
+    inverse = problem.plane.local_inverse(problem.origin)
+    return correlation, np.einsum('ijn,jn->in', inverse, motion)

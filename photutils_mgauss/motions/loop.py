@@ -2,353 +2,124 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri, ndtr
 
-from photutils_mgauss.motions.frames import (
-    Frames,
-    Gauge,
-    chi2_limit,
-    floor_variance,
-    solve_frames,
-    worst_outliers,
-)
+from photutils_mgauss.motions.frames import Frames, solve_frames
 from photutils_mgauss.motions.joint import (
     Estimates,
-    Priors,
-    Problem,
+    parallax_leak,
     reduce_all,
     solve_all,
+    total_chi2,
 )
-from photutils_mgauss.motions.references import build_priors, perspective
-from photutils_mgauss.motions.relative import (
-    Family,
-    mean_weights,
-    remove_mean_field,
-)
+from photutils_mgauss.motions.prepare import Setup, State
+from photutils_mgauss.motions.problem import MotionProblem
+from photutils_mgauss.motions.relative import remove_mean_fields
 from photutils_mgauss.motions.stacked import invert_2x2
 
 CONVERGED = 1e-3  # of the median error of a detection
 MAX_ITERATIONS = 40
-
-
-@dataclass(frozen=True, eq=False)
-class Options:
-    """What the fitter was asked for, checked; see `ProperMotionFitter`."""
-
-    transform: object
-    recipe: str
-    parallax: object
-    parallax_prior: tuple
-    acceleration: bool
-    systematic: object
-    clip: float | None
-    max_motion: float
-    hold_out: float
-    rng: object
-    executor: object
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """
-    Everything that stays the same while the fit iterates.
-
-    ``priors`` are those of all references in use, ``anchors`` (n,) marks the
-    references, ``relative`` says that there are none and all stars are.
-    """
-
-    sightings: object
-    options: Options
-    transform: object
-    origin: np.ndarray
-    working_year: float
-    dt: np.ndarray
-    observer: np.ndarray | None
-    priors: Priors
-    anchors: np.ndarray
-    held: np.ndarray
-    relative: bool
-    drift: np.ndarray | None
-
-
-@dataclass(frozen=True, eq=False)
-class State:
-    """
-    What changes from one iteration to the next.
-
-    ``maps`` (E, 2, b), ``used`` (E, n), ``floor`` (E,) variances per axis,
-    ``dropped`` (k,) stars that are references no longer, ``untied`` (n,)
-    stars whose detections disagree too much to find the frames with.
-    """
-
-    maps: np.ndarray
-    used: np.ndarray
-    floor: np.ndarray
-    dropped: np.ndarray
-    untied: np.ndarray
+SIGNIFICANT = 2.0  # standard deviations that call for a floor
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The last iteration: its problem, frames and estimates."""
+    """
+    The last iteration, finished.
 
-    scene: Scene
+    Parameters
+    ----------
+    setup : `~photutils_mgauss.motions.prepare.Setup`
+    state : `State`
+    problem : `~photutils_mgauss.motions.problem.MotionProblem`
+    frames : `~photutils_mgauss.motions.frames.Frames`
+    estimates : `~photutils_mgauss.motions.joint.Estimates`
+        With residuals.
+    chi2 : (n,) `~numpy.ndarray`
+        Of the detections of each star and of what was known of it.
+    ranks : (n,) int `~numpy.ndarray`
+        Number of parameters of each star that were known beforehand.
+    leak : tuple or None
+        What parallaxes that are not fitted do to motions, see
+        `~photutils_mgauss.motions.joint.parallax_leak`.
+    """
+
+    setup: Setup
     state: State
-    problem: Problem
+    problem: MotionProblem
     frames: Frames
     estimates: Estimates
+    chi2: np.ndarray
+    ranks: np.ndarray
+    leak: tuple | None
 
 
-def n_star_parameters(options):
-    """Return the number of parameters of a star."""
-    return 4 + bool(options.parallax) + 2 * options.acceleration
+def finished(setup, state, problem, frames, estimates):
+    """Return the `Fit` with these estimates of its stars."""
+    chi2 = total_chi2(problem, estimates)
+    observer, leak = setup.sightings.observer, None
+    if observer is not None and not setup.options.parallax:
+        leak = parallax_leak(replace(problem, observer=observer),
+                             setup.options.executor)
+    return Fit(setup, state, problem, frames, estimates, chi2, problem.ranks,
+               leak)
 
 
-def prepare(sightings, epochs, options):
-    """Return the `Scene` and the first `State`."""
-    years = sightings.years
-    working = float(np.nanmean(sightings.epoch_years))
-    dt = years - working
-    count = np.isfinite(sightings.places[0]).sum(axis=0)
-    with np.errstate(invalid='ignore'):
-        origin = (np.nansum(sightings.places, axis=1)
-                  / np.where(count, count, np.nan))
-    transform = options.transform.fitted_to(origin)
-    observer = (sightings.observers(epochs)
-                if sightings.plane is not None else None)
-    _check_parallax(options, observer)
-    origin = np.where(np.isfinite(origin), origin,
-                      np.reshape(transform.centre, (2, 1)))
-    scene = Scene(sightings, options, transform, origin, working,
-                  np.nan_to_num(dt), observer, None, None, None, False,
-                  None)
-    scene = _with_references(scene)
-    untied = _scattered(scene)
-    _check_references(scene, untied)
-    maps = np.repeat(transform.identity()[None], len(dt), axis=0)
-    return scene, State(maps, sightings.usable.copy(), _first_floor(scene),
-                        np.empty(0, dtype=int), untied)
-
-
-def _scattered(scene):
-    """
-    Return stars (n,) whose places are too far apart to be one star.
-
-    Identifiers may be wrong, and one such star would outweigh all others.
-    """
-    places = np.where(scene.sightings.usable, scene.sightings.places, np.nan)
-    count = scene.sightings.usable.sum(axis=0)
-    many = np.flatnonzero(count > 1)
-    spread = np.zeros(len(count))
-    spread[many] = (np.nanmax(places[..., many], axis=1)
-                    - np.nanmin(places[..., many], axis=1)).max(axis=0)
-    typical = spread[scene.anchors & (count > 1)]
-    limit = 30 * np.median(typical) if len(typical) else 0.0
-    baseline = np.ptp(scene.sightings.epoch_years)
-    scattered = spread > max(limit, scene.options.max_motion * baseline)
-    return scattered | ~scene.sightings.agreed
-
-
-def _check_parallax(options, observer):
-    if options.parallax and options.recipe == 'paper':
-        msg = ("parallax must be False for the recipe 'paper', got "
-               f'{options.parallax!r}')
-        raise ValueError(msg)
-    if options.parallax and observer is None:
-        msg = ('parallax must be False for epochs without a place in the '
-               f'sky, got {options.parallax!r}')
-        raise ValueError(msg)
-
-
-def _with_references(scene):
-    """Add priors, held-out references and known small displacements."""
-    sightings, options = scene.sightings, scene.options
-    n = len(sightings.names)
-    seen = sightings.references >= 0
-    stars = sightings.references[seen]
-    held = _hold_out(stars, options)
-    anchors = np.zeros(n, dtype=bool)
-    catalogue = _select(sightings.catalogue, seen, len(stars))
-    anchors[stars[catalogue.kinds != 'position']] = True
-    anchors[held] = False
-    use = ~np.isin(stars, held)
-    priors = build_priors(_select(catalogue, use, use.sum()), stars[use],
-                          scene.origin[:, stars[use]], scene.working_year,
-                          sightings.unit, n_star_parameters(options))
-    priors = _add_parallax_prior(priors, scene)
-    relative = not anchors.any()
-    if relative:
-        anchors = np.ones(n, dtype=bool)
-    return replace(scene, priors=priors, anchors=anchors, held=held,
-                   relative=relative, drift=_drift(scene, catalogue, stars))
-
-
-def _select(catalogue, which, n):
-    """Return part of a catalogue; references by name are all quasars."""
-    if catalogue is None:
-        from photutils_mgauss.motions.references import UNKNOWN, Catalogue
-        return Catalogue(None, np.full(n, 'qso'), np.full((5, n), np.nan),
-                         np.repeat(UNKNOWN * np.eye(5)[..., None], n, axis=2),
-                         np.full(n, np.nan), np.full(n, np.nan))
-    return replace(
-        catalogue, ids=None, kinds=catalogue.kinds[which],
-        values=catalogue.values[:, which],
-        covariance=catalogue.covariance[..., which],
-        year=catalogue.year[which],
-        radial_velocity=catalogue.radial_velocity[which])
-
-
-def _hold_out(stars, options):
-    n = round(options.hold_out * len(stars))
-    if n == 0:
-        return np.empty(0, dtype=int)
-    rng = np.random.default_rng(options.rng)
-    return np.sort(rng.choice(stars, n, replace=False))
-
-
-def _add_parallax_prior(priors, scene):
-    """Give stars of unknown parallax the one expected of them."""
-    if scene.options.parallax != 'prior':
-        return priors
-    mean, sigma = scene.options.parallax_prior
-    n, p = scene.origin.shape[1], n_star_parameters(scene.options)
-    precision, moment = np.zeros((p, p, n)), np.zeros((p, n))
-    constant = np.zeros(n)
-    precision[..., priors.stars] = priors.precision
-    moment[:, priors.stars] = priors.moment
-    constant[priors.stars] = priors.constant
-    free = precision[4, 4] == 0
-    precision[4, 4, free] = sigma**-2
-    moment[4, free] = mean / sigma**2
-    constant[free] += mean**2 / sigma**2
-    return Priors(np.arange(n), precision, moment, constant)
-
-
-def _drift(scene, catalogue, stars):
-    """
-    Return displacements (2, E, k) of references beyond the model, or None.
-
-    Known parallaxes where none are fitted, and perspective acceleration.
-    """
-    out = perspective(catalogue)[:, None, :]
-    dt = scene.dt if scene.dt.shape[1] == 1 else scene.dt[:, stars]
-    out = out * dt**2 / 2
-    parallax = np.nan_to_num(catalogue.values[4])
-    if scene.observer is not None and not scene.options.parallax:
-        observer = scene.observer
-        if observer.shape[2] > 1:
-            observer = observer[..., stars]
-        out = out + parallax * scene.sightings.plane.parallax_factors(
-            scene.origin[:, None, stars], observer)
-    return (stars, out) if np.any(out) else None
-
-
-def _first_floor(scene):
-    n_epochs = len(scene.sightings.epoch_years)
-    if isinstance(scene.options.systematic, str):
-        return np.zeros(n_epochs)
-    floor = np.asarray(scene.options.systematic, dtype=float)
-    if floor.shape not in ((), (n_epochs,)):
-        msg = (f'systematic must be one value or one per epoch '
-               f'({n_epochs}), got shape {floor.shape}')
-        raise ValueError(msg)
-    return np.broadcast_to(floor**2, n_epochs).copy()
-
-
-def _check_references(scene, untied):
-    """Raise where an epoch has fewer references than its map needs."""
-    need = scene.transform.n_references
-    if scene.transform.kind == 'none':
-        return
-    usable = scene.sightings.usable & scene.anchors & ~untied
-    if scene.relative:
-        usable = usable & (usable.sum(axis=0) > 1)
-    counts = usable.sum(axis=1)
-    if (counts < need).any():
-        e = int(np.argmin(counts))
-        what = ('stars in common with other epochs' if scene.relative
-                else 'reference objects')
-        if (untied & scene.anchors).any():
-            what += ' whose places agree'
-        msg = (f'epoch {e} must have at least {need} {what} for the '
-               f'transform {scene.transform.kind!r}, got {counts[e]}')
-        raise ValueError(msg)
-
-
-def build_problem(scene, state):
-    """Return the `Problem` of the present maps, masks and floors."""
-    sightings, transform = scene.sightings, scene.transform
+def pose(setup, state):
+    """Return the `MotionProblem` of the present maps, masks and floors."""
+    sightings, transform = setup.sightings, setup.transform
+    ties, priors = _ties(setup, state), setup.priors.without(state.dropped)
     offsets = np.empty_like(sightings.places)
     weights = np.empty_like(sightings.covariance)
     for e, coefficients in enumerate(state.maps):
         aligned = transform.apply(coefficients, sightings.places[:, e])
-        offsets[:, e] = aligned - scene.origin
-        weights[:, e] = np.where(
-            state.used[e], invert_2x2(*measured(scene, state, e)), 0.0)
-    if scene.drift is not None:
-        stars, drift = scene.drift
+        offsets[:, e] = aligned - setup.origin
+        covariance = measured(setup, state, e)
+        weights[:, e] = np.where(state.used[e], invert_2x2(*covariance), 0.0)
+    if setup.drift is not None:
+        stars, drift = setup.drift
         offsets[..., stars] -= drift
     np.nan_to_num(offsets, copy=False)
-    priors = scene.priors.without(state.dropped)
-    return Problem(
-        offsets, weights, scene.origin, scene.dt,
-        scene.observer if scene.options.parallax else None,
-        sightings.plane, transform, priors, scene.options.acceleration,
-        _ties(scene, state))
+    return MotionProblem(
+        offsets, weights, setup.origin, setup.dt,
+        sightings.observer if setup.options.parallax else None,
+        sightings.plane, transform, priors, setup.options.acceleration,
+        ties)
 
 
-def measured(scene, state, e):
+def measured(setup, state, e):
     """Return the covariances (3, n) of an epoch with its floor."""
     floor = np.broadcast_to(state.floor.T, (2, len(state.maps)))[:, e]
-    xx, xy, yy = scene.sightings.covariance[:, e]
+    xx, xy, yy = setup.sightings.covariance[:, e]
     return np.stack([xx + floor[0], xy, yy + floor[1]])
 
 
-def _ties(scene, state):
+def _ties(setup, state):
     """Return which stars take part in finding the frames."""
-    if scene.options.recipe == 'joint' or scene.relative:
+    if setup.options.recipe == 'joint' or setup.relative:
         return ~state.untied
-    ties = scene.anchors & ~state.untied
+    ties = setup.anchors & ~state.untied
     ties[state.dropped] = False
     return ties
 
 
-def gauge_of(scene):
-    """Return the `Gauge` of a scene's frames."""
-    dt = scene.dt.mean(axis=1)
-    factors = None
-    if scene.options.parallax:
-        observer = scene.observer.mean(axis=2)
-        factors = scene.sightings.plane.parallax_factors(
-            np.array(scene.transform.centre)[:, None], observer)
-    return Gauge.of(scene.transform, dt, factors, scene.options.acceleration)
-
-
-def step(scene, state):
+def _step(setup, state):
     """Solve for the frames once; return problem, frames and new maps."""
-    problem = build_problem(scene, state)
-    reduced = reduce_all(problem, scene.options.executor)
-    frames = solve_frames(reduced, scene.transform, gauge_of(scene),
-                          relative=scene.relative)
-    maps = np.stack([scene.transform.project(one)
+    problem = pose(setup, state)
+    reduced = reduce_all(problem, setup.options.executor)
+    frames = solve_frames(problem, reduced, relative=setup.relative)
+    maps = np.stack([setup.transform.project(one)
                      for one in state.maps + frames.correction])
     return problem, frames, replace(state, maps=maps)
 
 
-def change(scene, frames):
-    """Return the largest change of a map in units of a typical error."""
-    size = np.abs(frames.correction).sum(axis=2).max(initial=0.0)
-    variance = scene.sightings.covariance[0][scene.sightings.usable]
-    if variance.size == 0:
-        return 0.0
-    return size / np.sqrt(np.median(variance))
-
-
-def align(scene, state):
+def _align(setup, state):
     """Iterate until the maps stand still."""
-    before = np.inf
+    before, typical = np.inf, np.sqrt(setup.typical_variance)
     for i in range(MAX_ITERATIONS):
-        problem, frames, state = step(scene, state)
-        size = change(scene, frames)
+        problem, frames, state = _step(setup, state)
+        # In units of a typical error.
+        size = np.abs(frames.correction).sum(axis=2).max(initial=0) / typical
         if size < CONVERGED:
             break
         if i > 5 and not size < before:
@@ -360,120 +131,90 @@ def align(scene, state):
     return problem, frames, state
 
 
-def fit(scene, state):
-    """Return the `Fit` of a scene: align, reject, estimate the floors."""
-    fits_floor = scene.options.systematic == 'fit' if isinstance(
-        scene.options.systematic, str) else False
+def fit(setup, state):
+    """Return the `Fit` of a setup: align, reject, estimate the floors."""
     for _ in range(MAX_ITERATIONS):
-        problem, frames, state = align(scene, state)
-        if scene.options.clip is None:
+        problem, frames, state = _align(setup, state)
+        if setup.options.clip is None:
             break
-        state, changed = _review(scene, state, problem, frames, fits_floor)
+        state, changed = _review(setup, state, problem, frames)
         if not changed:
             break
-    for _ in range(4 * fits_floor):
-        floor = _floors(scene, state, problem, frames, _sum_floor)
+    for _ in range(4 * setup.options.fits_floor):
+        floor = _floors(setup, state, problem, frames)
         still = np.allclose(floor, state.floor, rtol=0.02,
-                            atol=1e-3 * _typical(scene))
+                            atol=1e-3 * setup.typical_variance)
         state = replace(state, floor=floor)
-        problem, frames, state = align(scene, state)
+        problem, frames, state = _align(setup, state)
         if still:
             break
-    estimates = solve_all(problem, frames.correction, frames.factor,
-                          scene.options.executor, residuals=True)
-    if scene.relative and scene.transform.kind != 'none':
-        state, estimates = _relative(scene, state, problem, frames,
-                                     estimates)
-    return Fit(scene, state, problem, frames, estimates)
+    estimates = solve(setup, problem, frames, residuals=True)
+    if setup.relative and setup.transform.kind != 'none':
+        estimates, drift = remove_mean_fields(problem, frames, estimates,
+                                              setup.options)
+        state = replace(state, maps=state.maps - drift)
+    return finished(setup, state, problem, frames, estimates)
 
 
-def families(scene):
-    """Return the common fields that stars without references may have."""
-    generators, dt = scene.transform.generators, scene.dt.mean(axis=1)
-    out = [Family((2, 3), generators, np.multiply.outer(dt, generators))]
-    if scene.options.acceleration:
-        p = n_star_parameters(scene.options)
-        out.append(Family((p - 2, p - 1), generators,
-                          np.multiply.outer(dt**2 / 2, generators)))
-    if scene.options.parallax is True:
-        family = gauge_of(scene).parallaxes
-        b, m = scene.transform.n_terms, family.shape[1]
-        if m:
-            out.append(Family((4,), np.eye(b)[:, :m],
-                              family.reshape(len(dt), 2 * b, m)))
-    return out
+def measured_alone(result):
+    """Return a `Fit` without priors, in the same frames."""
+    if result.setup.relative:
+        return result
+    problem = result.problem.unbound
+    estimates = solve(result.setup, problem, result.frames, residuals=True)
+    return finished(result.setup, result.state, problem, result.frames,
+                    estimates)
 
 
-def _relative(scene, state, problem, frames, estimates):
-    """Return state and estimates with the stars' mean fields at zero."""
-    maps = state.maps
-    for family in families(scene):
-        weights = mean_weights(estimates.values, estimates.covariance,
-                               list(family.rows), problem.ties)
-        estimates, field = remove_mean_field(
-            problem, frames, estimates, family, weights,
-            scene.options.executor)
-        maps = maps - (family.drifts @ field).reshape(maps.shape)
-    return replace(state, maps=maps), estimates
+def solve(setup, problem, frames, **wanted):
+    """Return the `Estimates` of the stars of a problem in given frames."""
+    return solve_all(problem, frames.correction, frames.factor,
+                     setup.options.executor, **wanted)
 
 
-def _typical(scene):
-    variance = scene.sightings.covariance[0][scene.sightings.usable]
-    return np.median(variance) if variance.size else 1.0
-
-
-def _review(scene, state, problem, frames, fits_floor):
+def _review(setup, state, problem, frames):
     """Return the state without outliers, and whether anything changed."""
-    if fits_floor:
-        floor = _floors(scene, state, problem, frames, _median_floor)
-        moved = np.abs(floor - state.floor) > (0.1 * state.floor
-                                               + 0.01 * _typical(scene))
+    if setup.options.fits_floor:
+        floor = _floors(setup, state, problem, frames, robust=True)
+        moved = np.abs(floor - state.floor) > (
+            0.1 * state.floor + 0.01 * setup.typical_variance)
         if moved.any():
             # Residuals are judged once the floors are right: a floor that
             # is too small would make outliers of all bright stars.
             return replace(state, floor=floor), True
-    estimates = solve_all(problem, frames.correction, frames.factor,
-                          scene.options.executor, judge=True)
-    dropped = _discrepant(scene, problem, frames)
+    dropped = _discrepant(setup, problem, frames)
     if len(dropped):
         return replace(state, dropped=np.union1d(state.dropped,
                                                  dropped)), True
+    estimates = solve(setup, problem, frames, judge=True)
     bad = worst_outliers(estimates.chi2, state.used, _spare(problem, state),
-                         scene.options.clip)
+                         setup.options.clip)
     if bad.any():
         return replace(state, used=state.used & ~bad), True
-    untied = state.untied | _inconsistent(scene, problem, estimates)
+    untied = state.untied | _inconsistent(setup, problem, estimates)
     return replace(state, untied=untied), bool(
         (untied & ~state.untied).any())
 
 
-def _inconsistent(scene, problem, estimates):
+def _inconsistent(setup, problem, estimates):
     """Return stars (n,) that no more rejections can make agree."""
     dof = 2 * (problem.weights[0] > 0).sum(axis=0) - problem.n_parameters
     chi2 = np.nansum(estimates.raw, axis=0)
-    out = (dof > 0) & (chi2 > chi2_limit(scene.options.clip,
+    out = (dof > 0) & (chi2 > chi2_limit(setup.options.clip,
                                          np.maximum(dof, 1)))
     # References agree with their catalogue, or are none any more.
-    out[problem.priors.stars] &= ~scene.anchors[problem.priors.stars] | (
-        scene.relative)
+    out[problem.priors.stars] &= ~setup.anchors[problem.priors.stars] | (
+        setup.relative)
     return out
 
 
 def _spare(problem, state):
     """Return the stars that can lose a detection and still be judged."""
-    count = 2 * state.used.sum(axis=0)
-    rank = np.zeros(count.shape, dtype=int)
-    rank[problem.priors.stars] = prior_rank(problem.priors)
-    return count + rank - 2 >= problem.n_parameters + 2
+    known = 2 * state.used.sum(axis=0) + problem.ranks
+    return known - 2 >= problem.n_parameters + 2
 
 
-def prior_rank(priors):
-    """Return the number of parameters (k,) each prior knows."""
-    return np.linalg.matrix_rank(np.moveaxis(priors.precision, 2, 0),
-                                 hermitian=True)
-
-
-def _discrepant(scene, problem, frames):
+def _discrepant(setup, problem, frames):
     """
     Return references whose catalogue values the data contradict.
 
@@ -481,18 +222,15 @@ def _discrepant(scene, problem, frames):
     the catalogue, which a mistaken identity or motion makes large however
     well the star's own detections agree.
     """
-    stars = problem.priors.stars[scene.anchors[problem.priors.stars]]
-    if scene.relative or len(stars) <= scene.transform.n_references:
+    stars = problem.priors.stars[setup.anchors[problem.priors.stars]]
+    if setup.relative or len(stars) <= setup.transform.n_references:
         return np.empty(0, dtype=int)
     alone = problem.select(stars)
-    free = replace(alone, priors=Priors.none(problem.n_parameters))
-    without = solve_all(free, frames.correction, frames.factor, None,
-                        residuals=True)
-    with_it = solve_all(alone, frames.correction, frames.factor, None,
-                        residuals=True)
-    bound = data_chi2(with_it, alone) + alone.priors.chi2(with_it.values)
-    rise = bound - data_chi2(without, free)
-    limit = chi2_limit(scene.options.clip, prior_rank(alone.priors))
+    bound, free = (
+        total_chi2(one, solve(setup, one, frames, residuals=True))
+        for one in (alone, alone.unbound))
+    rise = bound - free
+    limit = chi2_limit(setup.options.clip, alone.ranks)
     worst = np.nan_to_num(rise / limit, nan=0.0)
     # A few at a time: one bad reference pulls the frame from the others.
     most = max(1, len(stars) // 20)
@@ -500,33 +238,89 @@ def _discrepant(scene, problem, frames):
     return stars[chosen[worst[chosen] > 1]]
 
 
-def data_chi2(estimates, problem):
-    """Return the chi-square (n,) of the detections of each star."""
-    x, y = estimates.residuals
-    xx, xy, yy = problem.weights
-    return np.sum(xx * x * x + 2 * xy * x * y + yy * y * y, axis=0)
-
-
-def _floors(scene, state, problem, frames, estimate):
+def _floors(setup, state, problem, frames, *, robust=False):
     """Return the floor variances (E,) from the references' residuals."""
-    stars = np.flatnonzero(problem.ties & scene.anchors
+    stars = np.flatnonzero(problem.ties & setup.anchors
                            & ~np.isin(np.arange(problem.n_stars),
                                       state.dropped))
-    estimates = solve_all(problem.select(stars), frames.correction,
-                          frames.factor, scene.options.executor,
-                          residuals=True, judge=True)
-    covariance = scene.sightings.covariance[..., stars]
+    estimates = solve(setup, problem.select(stars), frames, residuals=True,
+                       judge=True)
+    covariance = setup.sightings.covariance[..., stars]
     used = state.used[:, stars]
-    return np.array([estimate(
+    return np.array([floor_variance(
         np.where(used[e], estimates.residuals[:, e], np.nan),
-        covariance[:, e], estimates.expected[e], state.floor[e])
-        for e in range(len(state.floor))])
+        covariance[:, e], estimates.expected[e], state.floor[e],
+        robust=robust) for e in range(len(state.floor))])
 
 
-def _sum_floor(residuals, covariance, expected, floor):
-    return floor_variance(residuals, covariance, expected, floor)
+def chi2_limit(clip, dof):
+    """Return the chi-square as rare as a deviation by ``clip`` sigma."""
+    return chdtri(dof, 2 * ndtr(-clip))
 
 
-def _median_floor(residuals, covariance, expected, floor):
-    return floor_variance(residuals, covariance, expected, floor,
-                          robust=True)
+def worst_outliers(chi2, used, spare, clip):
+    """
+    Return which detections to reject now, (E, n): each star's worst.
+
+    Only one of a star's goes at a time, because a bad one spoils the
+    residuals of the good; and only where ``spare`` (n,) says the star has
+    detections enough to tell the bad one.
+    """
+    limit = chi2_limit(clip, 2)
+    chi2 = np.where(used, np.nan_to_num(chi2, nan=0.0), 0.0)
+    worst = chi2.argmax(axis=0)
+    out = np.zeros(used.shape, dtype=bool)
+    stars = np.arange(used.shape[1])
+    out[worst, stars] = (chi2[worst, stars] > limit) & spare
+    return out
+
+
+def floor_variance(residuals, covariance, expected, floor, *,
+                   robust=False):
+    r"""
+    Return the variance per axis that makes one epoch's chi-square expected.
+
+    Parameters
+    ----------
+    residuals : (2, n) `~numpy.ndarray`
+    covariance : (3, n) `~numpy.ndarray`
+        Covariances of the measurements without the floor.
+    expected : (n,) `~numpy.ndarray`
+        Expected chi-square of each, 2 minus its leverage.
+    floor : float
+        The present variance.
+    robust : bool, optional
+        Make the median of the chi-squares the expected one instead of their
+        sum, for data with outliers.
+
+    Notes
+    -----
+    Solves :math:`\sum r^T (\Sigma + s I)^{-1} r = \sum (2 - h)` for s by
+    bisection in a safe bracket; 0 where the errors explain the residuals.
+    """
+    good = np.isfinite(residuals).all(axis=0) & np.isfinite(expected)
+    good &= expected > 0.1
+    residuals, covariance = residuals[:, good], covariance[:, good]
+    expected = expected[good]
+    if expected.sum() < 4:
+        return 0.0
+
+    def excess(variance):
+        xx, xy, yy = covariance
+        a, b, c = invert_2x2(xx + variance, xy, yy + variance)
+        x, y = residuals
+        chi2 = a * x * x + 2 * b * x * y + c * y * y
+        if robust:
+            return np.median(chi2 / expected) - np.log(2)
+        return chi2.sum() - expected.sum()
+    # An excess that good errors alone would show every twentieth time is
+    # not worth a floor, which would only make all errors too large.
+    noise = (1 / np.sqrt(len(expected)) if robust
+             else np.sqrt(2 * expected.sum()))
+    low, high = 0.0, max(floor, np.max(residuals**2), 1e-30)
+    if excess(0.0) <= SIGNIFICANT * noise:
+        return 0.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
+    return (low + high) / 2

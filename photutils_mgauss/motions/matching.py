@@ -7,12 +7,17 @@ and the known motions. Stars missing from some exposures are kept.
 """
 from dataclasses import dataclass
 
+import astropy.units as u
 import numpy as np
 from scipy.spatial import cKDTree
+
+from photutils_mgauss.motions.epoch import Detections
+from photutils_mgauss.utils.robust import std_about_zero
 
 # Field stars that tie one exposure to the next one before it is matched.
 SAMPLE = 20000
 N_SIGMA = 5.0
+POINTING = 2000.0  # mas: offsets of exposures that are looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,6 +300,255 @@ def _affine_tie(tree, places, reach):
         fit = np.linalg.lstsq(design[:, good].T, target.T, rcond=None)[0].T
         matrix = fit / np.array([1, scale, scale])
         residual = target - fit @ design[:, good]
-        rms = 1.4826 * np.median(np.hypot(*residual)) / np.sqrt(2)
+        rms = std_about_zero(np.hypot(*residual)) / np.sqrt(2)
         reach = min(reach, max(6 * rms, reach / 4))
     return matrix, rms
+
+
+@dataclass(frozen=True)
+class HowToMatch:
+    """How epochs are matched; see `ProperMotionFitter`."""
+
+    by: str
+    radius: u.Quantity | None
+    max_motion: u.Quantity
+
+    def tolerance(self, unit):
+        """Return the `Tolerance` in the units of a frame."""
+        radius = None
+        if self.radius is not None:
+            radius = self.radius.to_value(u.Unit(unit))
+        if unit == 'pix':
+            return Tolerance(radius, 0.0, 20 * (radius or 0.0))
+        pointing = POINTING if radius is None else max(POINTING, 2 * radius)
+        return Tolerance(radius, self.max_motion.to_value(u.mas / u.yr),
+                         pointing)
+
+
+def match_epochs(detections, on_sky, catalogue, how, unit):
+    """
+    Match epochs by identifier or position, as their user wants it.
+
+    Parameters
+    ----------
+    detections : list of `~photutils_mgauss.motions.epoch.Detections`
+    on_sky : bool
+        Whether all epochs have places in the sky.
+    catalogue : `~photutils_mgauss.motions.references.Catalogue` or None
+        Reference objects, matched along by position.
+    how : `HowToMatch`
+    unit : {'mas', 'pix'}
+
+    Returns
+    -------
+    every : `~photutils_mgauss.motions.epoch.Detections`
+        Those of all n stars at E epochs, and the names of the stars.
+    matches : `Matches`
+        Every star is in some epoch.
+    known : (k,) int `~numpy.ndarray` or None
+        The star of each object of the catalogue, -1 where it is in no
+        epoch; None where it has no positions or is not matched by them.
+    """
+    if _is_by_id(detections, on_sky, how, unit):
+        matches, names = match_ids([one.ids for one in detections])
+        known = None
+    else:
+        matches, names, known = _match_on_plane(detections, catalogue,
+                                                how.tolerance(unit))
+    every = _stack(matches, names, detections)
+    if not (every.found.sum(axis=0) > 1).any():
+        msg = ('epochs must have stars in common, got none that is in two '
+               'of them')
+        raise ValueError(msg)
+    return every, matches, known
+
+
+def _stack(matches, names, detections):
+    """Return the `Detections` of all stars at all epochs."""
+    def take(name, fill=np.nan):
+        return matches.take([getattr(one, name) for one in detections], fill)
+    years = [one.years for one in detections]
+    if all(year.ndim == 0 for year in years):
+        years = np.array(years)[:, None]
+    else:
+        years = matches.take([
+            np.broadcast_to(year, one.found.shape)
+            for year, one in zip(years, detections, strict=True)])
+    return Detections(names, take('plane'), take('covariance'), years,
+                      take('flux'), take('found', False),
+                      take('usable', False))
+
+
+def _is_by_id(detections, on_sky, how, unit):
+    """Return whether to match by identifier."""
+    have = all(one.ids is not None for one in detections)
+    if how.by == 'id' and not have:
+        msg = "epochs must all have a column 'id' to be matched by it"
+        raise ValueError(msg)
+    if how.by == 'sky' and not on_sky and how.radius is None:
+        msg = ('match_radius must be given to match epochs without a WCS '
+               'by position')
+        raise ValueError(msg)
+    if how.by != 'auto':
+        return how.by == 'id'
+    if not on_sky:
+        if not have and how.radius is None:
+            msg = ("epochs without a WCS must have a column 'id', or "
+                   'match_radius must be given')
+            raise ValueError(msg)
+        return have
+    return have and _same_objects(detections, how.tolerance(unit))
+
+
+def _same_objects(detections, tolerance):
+    """
+    Return whether equal identifiers are equal places in the sky.
+
+    The row numbers photutils gives its sources are not identifiers.
+    """
+    if len({one.ids.dtype.kind in 'iuf' for one in detections}) > 1:
+        return False
+    matches, _ = match_ids([one.ids for one in detections])
+    places = matches.take([one.plane for one in detections])
+    common = np.isfinite(places[0]).sum(axis=0) > 1
+    if not common.any():
+        return False
+    places = _without_offsets(places[..., common])
+    spread = (np.nanmax(places, axis=1)
+              - np.nanmin(places, axis=1)).max(axis=0)
+    return np.median(spread) < tolerance.pointing
+
+
+def _without_offsets(places):
+    """Return places (2, E, n) less what each epoch is off in common."""
+    for _ in range(5):  # Stars that are missing from epochs blur the mean.
+        away = places - np.nanmean(places, axis=1, keepdims=True)
+        offset = np.array([[np.median(one[np.isfinite(one)])
+                            if np.isfinite(one).any() else 0.0
+                            for one in axis] for axis in away])
+        places = places - offset[..., None]
+    return places
+
+
+def _match_on_plane(detections, catalogue, tolerance):
+    """
+    Return matches by position, names, and the stars of the catalogue.
+
+    The last is None for a catalogue without positions; its objects that no
+    epoch has seen are not among the stars.
+    """
+    years = [float(np.nanmean(one.years)) for one in detections]
+    sigmas = []
+    for one in detections:
+        with np.errstate(invalid='ignore'):
+            sigmas.append(np.sqrt((one.covariance[0]
+                                   + one.covariance[2]) / 2))
+    known = None
+    if catalogue is not None and np.isfinite(catalogue.values[:2]).any():
+        known = (catalogue.values[:2], catalogue.motion(),
+                 np.nan_to_num(catalogue.year, nan=years[0]))
+    matches = match_positions([one.plane for one in detections], sigmas,
+                              years, tolerance, known)
+    n_known = 0 if known is None else known[0].shape[1]
+    seen = matches.seen.any(axis=0)
+    number = np.where(seen, np.cumsum(seen) - 1, -1)
+    matches = Matches(matches.rows[:, seen], matches.ambiguous[seen])
+    if known is None or catalogue.ids is None:
+        names = _names_of_epochs(matches, detections)
+    else:
+        names = _names_of_catalogue(catalogue.ids[seen[:n_known]],
+                                    matches.rows.shape[1])
+    return matches, names, None if known is None else number[:n_known]
+
+
+def _names_of_catalogue(ids, n):
+    """Return the catalogue's identifiers, and new ones for the rest."""
+    rest = np.arange(n - len(ids))
+    if ids.dtype.kind in 'iu':
+        return np.append(ids, (ids.max() + 1 if len(ids) else 0) + rest)
+    return np.append(ids.astype(str), [f'new{k}' for k in rest])
+
+
+def _names_of_epochs(matches, detections):
+    """Return the epochs' identifiers if they are unique, else numbers."""
+    n = matches.rows.shape[1]
+    ids = [one.ids for one in detections]
+    if any(one is None for one in ids) or len(
+            {one.dtype.kind in 'iuf' for one in ids}) > 1:
+        return np.arange(n)
+    first = matches.seen.argmax(axis=0)
+    names = np.concatenate([ids[e][matches.rows[e, first == e]]
+                            for e in range(len(ids))])
+    if len(np.unique(names)) < n:
+        return np.arange(n)
+    out = np.empty(n, dtype=names.dtype)
+    out[np.argsort(first, kind='stable')] = names
+    return out
+
+
+def find_references(catalogue, detections, years, tolerance):
+    """
+    Return the star (k,) of each object of a catalogue, -1 where not seen.
+
+    ``detections`` are those of all stars at E epochs, whose mean Julian
+    years are ``years`` (E,).
+    """
+    if catalogue.ids is not None:
+        return _lookup(catalogue.ids, detections.ids)
+    if not np.isfinite(catalogue.values[:2]).all(axis=0).any():
+        msg = ("references must have a column 'id' or positions to be found "
+               'among the stars')
+        raise ValueError(msg)
+    found = np.full(len(catalogue.kinds), -1)
+    for e, year in enumerate(years):
+        # Epoch by epoch: frames that differ would blur a star's mean place.
+        known = (catalogue.values[:2], catalogue.motion(),
+                 np.nan_to_num(catalogue.year, nan=year))
+        sigma = np.sqrt(detections.covariance[[0, 2], e].mean(axis=0))
+        matches = match_positions([detections.plane[:, e]], [sigma], [year],
+                                  tolerance, known)
+        stars = matches.rows[0, :len(found)]
+        new = (found < 0) & ~np.isin(stars, found)
+        found[new] = stars[new]
+    return found
+
+
+def _lookup(ids, names):
+    ids = np.asarray(ids)
+    if (ids.dtype.kind in 'iuf') != (names.dtype.kind in 'iuf'):
+        msg = (f'references must have identifiers like those of the epochs, '
+               f'got {ids.dtype} and {names.dtype}')
+        raise TypeError(msg)
+    order = np.argsort(names)
+    place = np.searchsorted(names, ids, sorter=order)
+    place = order[np.minimum(place, len(names) - 1)]
+    return np.where(names[place] == ids, place, -1)
+
+
+def named_references(references, names, rows, epochs):
+    """
+    Return the stars that identifiers or a column mark as references.
+
+    ``rows`` (E, n) are those of the stars in the tables of the epochs, -1
+    where they are missing.
+    """
+    if isinstance(references, str):
+        marked = np.zeros(len(names), dtype=bool)
+        for epoch, row in zip(epochs, rows, strict=True):
+            seen = row >= 0
+            marked[seen] |= _marked(epoch.table, references)[row[seen]]
+        return np.flatnonzero(marked)
+    if not np.iterable(references):
+        msg = ('references must be a table, identifiers, or the name of a '
+               f'column of every epoch, got {references!r}')
+        raise TypeError(msg)
+    return _lookup(list(references), names)
+
+
+def _marked(table, name):
+    if name not in table.colnames:
+        msg = (f'references must be a table, identifiers, or the name of a '
+               f'column of every epoch, got {name!r}; there is '
+               f'{table.colnames}')
+        raise ValueError(msg)
+    return np.ma.filled(np.ma.asarray(table[name]), False).astype(bool)

@@ -19,10 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from photutils_mgauss.motions.frames import MOTIONS, POSITIONS, Frames
-from photutils_mgauss.motions.joint import Priors, solve_all
-from photutils_mgauss.motions.loop import Fit, build_problem
-from photutils_mgauss.motions.references import FIXED
-from photutils_mgauss.sky.transforms import Transform
+from photutils_mgauss.motions.loop import finished, pose, solve
+from photutils_mgauss.motions.priors import Priors
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,17 +37,17 @@ class Displacements:
     motion: np.ndarray
 
 
-def paper_scene(scene):
-    """Return a scene whose maps are shifts and whose stars have no priors."""
-    transform = Transform('shift').fitted_to(scene.origin)
-    return replace(scene, transform=transform, priors=Priors.none(4),
+def paper_setup(setup):
+    """Return a setup whose maps are shifts and whose stars have no priors."""
+    transform = replace(setup.transform, kind='shift', degree=1)
+    return replace(setup, transform=transform, priors=Priors.none(4),
                    drift=None)
 
 
-def displacements(scene, state):
+def displacements(setup, state):
     """Return the `Displacements` of the reference objects."""
-    first = int(np.argmin(scene.sightings.epoch_years))
-    places = np.where(state.used & scene.anchors, scene.sightings.places,
+    first = int(np.argmin(setup.sightings.epoch_years))
+    places = np.where(state.used & setup.anchors, setup.sightings.places,
                       np.nan)
     moved = places - places[:, first][:, None]
     count = np.isfinite(moved[0]).sum(axis=1)
@@ -61,20 +59,15 @@ def displacements(scene, state):
     mean = np.nanmean(moved, axis=2)
     scatter = np.nansum((moved - mean[..., None])**2, axis=2)
     error = np.sqrt(scatter / np.maximum(count - 1, 1) / count)
-    return Displacements(mean, error, _mean_motion(scene))
+    return Displacements(mean, error, _mean_motion(setup))
 
 
-def _mean_motion(scene):
+def _mean_motion(setup):
     """Return the mean catalogue motion (2,) of the references in use."""
-    catalogue, references = (scene.sightings.catalogue,
-                             scene.sightings.references)
-    if catalogue is None or scene.relative:
+    use = setup.anchors[setup.sightings.references]
+    if setup.relative:
         return np.zeros(2)
-    seen = np.flatnonzero(references >= 0)
-    use = seen[scene.anchors[references[seen]]]
-    motion = np.where(np.isin(catalogue.kinds[use], FIXED), 0.0,
-                      catalogue.values[2:4, use])
-    return motion.mean(axis=1)
+    return setup.sightings.catalogue.motion()[:, use].mean(axis=1)
 
 
 def frame_error(found, dt, eps_t):
@@ -84,19 +77,19 @@ def frame_error(found, dt, eps_t):
     return np.abs(found.mean - np.multiply.outer(found.motion, dt))
 
 
-def fit_paper(scene, state, eps_t):
+def fit_paper(setup, state):
     """Return the `Fit` of the paper's recipe."""
-    scene = paper_scene(scene)
-    found = displacements(scene, state)
-    dt = scene.sightings.epoch_years - scene.sightings.epoch_years.min()
+    setup = paper_setup(setup)
+    found = displacements(setup, state)
+    dt = setup.sightings.epoch_years - setup.sightings.epoch_years.min()
     # Moving the frames along with the references' own mean motion makes the
     # slope a + mean(mu_r) at once.
     shift = np.multiply.outer(found.motion, dt) - found.mean
-    maps = np.repeat(scene.transform.identity()[None], len(dt), axis=0)
+    maps = np.repeat(setup.transform.identity()[None], len(dt), axis=0)
     maps[..., 0] += shift.T
-    state = replace(state, maps=maps,
-                    floor=frame_error(found, dt, eps_t).T**2)
-    problem = build_problem(scene, state)
+    errors = frame_error(found, dt, setup.options.eps_t)
+    state = replace(state, maps=maps, floor=errors.T**2)
+    problem = pose(setup, state)
     # Eq. 11 takes each coordinate by itself.
     weights = problem.weights.copy()
     weights[1] = 0.0
@@ -104,7 +97,6 @@ def fit_paper(scene, state, eps_t):
     empty = np.zeros((maps.size, 0))
     notes = (POSITIONS, MOTIONS.format(field=''))
     frames = Frames(np.zeros_like(maps), empty,
-                    notes if scene.relative else notes[:1])
-    estimates = solve_all(problem, frames.correction, empty,
-                          scene.options.executor, residuals=True)
-    return Fit(scene, state, problem, frames, estimates)
+                    notes if setup.relative else notes[:1])
+    estimates = solve(setup, problem, frames, residuals=True)
+    return finished(setup, state, problem, frames, estimates)

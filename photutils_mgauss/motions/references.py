@@ -5,14 +5,12 @@ Classes, one per object: 'qso' (or 'galaxy': motion and parallax zero),
 'star' (a catalogue's motion, and position and parallax where it has them),
 'position' (a position without a motion: unknown, never zero).
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import astropy.units as u
 import numpy as np
-from astropy.table import Table
 
 from photutils_mgauss.motions.epoch import find_column, numbers
-from photutils_mgauss.motions.joint import Priors
 from photutils_mgauss.motions.stacked import apply
 from photutils_mgauss.sky.observers import julian_years
 from photutils_mgauss.sky.tangent_plane import unit_vectors
@@ -22,9 +20,6 @@ FIXED = ('qso', 'galaxy')  # neither move nor have a parallax
 GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
 UNKNOWN = 1e30  # variance of what is not known
 ORDER = [0, 1, 3, 4, 2]  # Gaia's order to ours: position, motion, parallax
-# "Zero" motion and parallax of a quasar, in units of the frame's own: an
-# exact zero would make the equations singular.
-ZERO = {'mas': 1e-4, 'pix': 1e-6}
 # mas/yr^2 of perspective acceleration for unit motion [mas/yr], parallax
 # [mas] and radial velocity [km/s]: -2 / (4.74047 km/s * 206264806 mas).
 PERSPECTIVE = -2 / (4.740470446 * 206264806.24709636)
@@ -49,35 +44,53 @@ class Catalogue:
     def motion(self):
         """Return motions (2, k) as far as they are known."""
         motion = self.values[2:4].copy()
-        motion[:, _fixed(self.kinds)] = 0
+        motion[:, self.fixed] = 0
         return motion
 
+    @property
+    def fixed(self):
+        """Which objects neither move nor have a parallax, (k,)."""
+        return np.isin(self.kinds, FIXED)
 
-def _fixed(kinds):
-    return np.isin(kinds, FIXED)
+    def select(self, which):
+        """Return some of the objects, without their identifiers."""
+        return replace(
+            self, ids=None, kinds=self.kinds[which],
+            values=self.values[:, which],
+            covariance=self.covariance[..., which], year=self.year[which],
+            radial_velocity=self.radial_velocity[which])
+
+
+def quasars(n):
+    """Return the `Catalogue` of n quasars at places nobody knows."""
+    nothing = np.full(n, np.nan)
+    return Catalogue(None, np.full(n, 'qso'), np.full((5, n), np.nan),
+                     np.repeat(UNKNOWN * np.eye(5)[..., None], n, axis=2),
+                     nothing, nothing)
 
 
 def read_catalogue(table, plane, unit):
     """Return the `Catalogue` of a table of references."""
     n = len(table)
     kinds = _kinds(table)
+    years = _years(table, kinds)
     values = np.full((5, n), np.nan)
-    values[:2] = _positions(table, plane, unit)
     per_year = _unit(unit) / u.yr
     for k, name in ((2, 'pmra'), (3, 'pmdec')):
         values[k] = _numbers(table, name, per_year)
     values[4] = _numbers(table, 'parallax', _unit(unit))
+    _check_motions(kinds, values)
+    velocity = _numbers(table, 'radial_velocity', u.km / u.s)
+    ids = np.asarray(table['id']) if 'id' in table.colnames else None
     covariance = _covariance(table, unit)
+    values[:2] = _positions(table, plane, unit)
     if plane is not None and np.isfinite(values[:2]).any():
         turn = np.zeros((5, 5, n))
         turn[:2, :2] = turn[2:4, 2:4] = plane.local_jacobian(values[:2])
         turn[4, 4] = 1
         values[2:4] = apply(turn[2:4, 2:4], values[2:4])
         covariance = np.einsum('ijn,jkn,lkn->iln', turn, covariance, turn)
-    _check_motions(kinds, values)
-    ids = np.asarray(table['id']) if 'id' in table.colnames else None
-    return Catalogue(ids, kinds, values, covariance, _years(table, kinds),
-                     _numbers(table, 'radial_velocity', u.km / u.s))
+    return Catalogue(ids, kinds, values, covariance, years, velocity)
 
 
 def _unit(unit):
@@ -184,64 +197,8 @@ def _check_motions(kinds, values):
         raise ValueError(msg)
 
 
-def build_priors(catalogue, stars, origin, year, unit, n_parameters):
-    """
-    Return the `Priors` of references with the numbers ``stars``.
-
-    ``origin`` (2, k) are the places their positions are relative to, and
-    ``year`` the working epoch. ``n_parameters`` is 4, 5 (parallax), 6 or 7
-    (acceleration, about which catalogues say nothing).
-    """
-    has_parallax = n_parameters % 2 == 1
-    size = 5 if has_parallax else 4
-    k = len(stars)
-    precision = np.zeros((n_parameters, n_parameters, k))
-    moment = np.zeros((n_parameters, k))
-    constant = np.zeros(k)
-    for i in range(k):
-        matrix, covariance, value = _known(catalogue, i, origin[:, i], year,
-                                           unit, size)
-        weighted = np.linalg.solve(covariance, matrix)
-        precision[:size, :size, i] = matrix.T @ weighted
-        moment[:size, i] = value @ weighted
-        constant[i] = value @ np.linalg.solve(covariance, value)
-    order = np.argsort(stars)
-    return Priors(np.asarray(stars), precision, moment,
-                  constant).pick(order)
-
-
-def _known(catalogue, i, origin, year, unit, size):
-    """
-    Return what is known of reference i: matrix M, covariance and values.
-
-    The catalogue's values are M v for the parameters v at the working
-    epoch; rows without an error are left out.
-    """
-    value = catalogue.values[:, i].copy()
-    covariance = catalogue.covariance[..., i].copy()
-    matrix = np.eye(5)
-    if np.isfinite(catalogue.year[i]):
-        matrix[0, 2] = matrix[1, 3] = catalogue.year[i] - year
-    value[:2] -= origin
-    if _fixed(catalogue.kinds[i]):
-        value[2:] = 0
-        covariance[2:] = covariance[:, 2:] = 0
-        covariance[[2, 3, 4], [2, 3, 4]] = ZERO[unit]**2
-    if catalogue.kinds[i] == 'position':
-        value[2:] = np.nan
-    known = np.isfinite(value) & (np.diag(covariance) < 1e-3 * UNKNOWN)
-    known = np.flatnonzero(known[:size])
-    return (matrix[known, :size], covariance[np.ix_(known, known)],
-            value[known])
-
-
 def perspective(catalogue):
     """Return known perspective accelerations (2, k) [unit/yr^2], 0 else."""
     rate = (PERSPECTIVE * catalogue.values[4] * catalogue.radial_velocity
             * catalogue.values[2:4])
     return np.nan_to_num(rate)
-
-
-def is_table(references):
-    """Whether references came as a table."""
-    return isinstance(references, Table)

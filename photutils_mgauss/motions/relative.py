@@ -17,9 +17,12 @@ from operator import add
 
 import numpy as np
 
-from photutils_mgauss.motions.joint import eliminate, parts, scaled_rows
-from photutils_mgauss.motions.stacked import gram
+from photutils_mgauss.motions.frames import Gauge
+from photutils_mgauss.motions.joint import eliminate, scaled_rows
+from photutils_mgauss.motions.problem import MotionProblem, parts
+from photutils_mgauss.motions.stacked import Summed, gram
 from photutils_mgauss.utils.parallel import map_parallel
+from photutils_mgauss.utils.robust import std_about_zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,23 +45,19 @@ class Family:
 
 
 @dataclass(frozen=True, eq=False)
-class Sums:
+class Sums(Summed):
     """Sums over stars: P (m, m), c (m,) and the frames' part (m, q)."""
 
     normal: np.ndarray
     moment: np.ndarray
     frames: np.ndarray
 
-    def __add__(self, other):
-        return Sums(self.normal + other.normal, self.moment + other.moment,
-                    self.frames + other.frames)
-
 
 @dataclass(frozen=True, eq=False)
 class Piece:
     """A part of the stars, with what is needed of all of them."""
 
-    problem: object
+    problem: MotionProblem
     factor: np.ndarray
     family: Family
     weights: np.ndarray
@@ -130,6 +129,43 @@ def _move(piece):
     return values, covariance
 
 
+def families(problem, *, parallax):
+    """
+    Return the common fields that stars without references may have.
+
+    ``parallax`` says whether one of parallaxes is among them.
+    """
+    generators, dt = problem.transform.generators, problem.dt.mean(axis=1)
+    out = [Family((2, 3), generators, np.multiply.outer(dt, generators))]
+    if problem.acceleration:
+        p = problem.n_parameters
+        out.append(Family((p - 2, p - 1), generators,
+                          np.multiply.outer(dt**2 / 2, generators)))
+    if parallax:
+        drifts = Gauge.of(problem).parallaxes
+        b, m = problem.transform.n_terms, drifts.shape[1]
+        if m:
+            out.append(Family((4,), np.eye(b)[:, :m],
+                              drifts.reshape(len(dt), 2 * b, m)))
+    return out
+
+
+def remove_mean_fields(problem, frames, estimates, options):
+    """
+    Return estimates whose mean fields are zero, and the maps' drift.
+
+    The drift (E, 2, b) is what the maps had too much of.
+    """
+    drift = np.zeros_like(frames.correction)
+    for family in families(problem, parallax=options.parallax is True):
+        weights = mean_weights(estimates.values, estimates.covariance,
+                               list(family.rows), problem.ties)
+        estimates, field = remove_mean_field(
+            problem, frames, estimates, family, weights, options.executor)
+        drift += (family.drifts @ field).reshape(drift.shape)
+    return estimates, drift
+
+
 def remove_mean_field(problem, frames, estimates, family, weights, executor):
     """Return estimates without the mean field, and the field q (m,)."""
     def pieces(**others):
@@ -154,7 +190,7 @@ def mean_weights(values, covariance, rows, usable):
     """
     middle = np.nanmedian(values[rows][:, usable], axis=1)[:, None]
     away = values[rows] - middle
-    scatter = 1.4826 * np.nanmedian(np.abs(away[:, usable]))
+    scatter = std_about_zero(away[:, usable])
     variance = np.mean([covariance[k, k] for k in rows], axis=0)
     distance = np.abs(away).max(axis=0)
     near = usable & (distance <= 5 * np.sqrt(scatter**2 + variance))

@@ -5,6 +5,8 @@ A stack of n symmetric p x p matrices has shape (p, p, n). Loops run over
 the few rows and columns, so every operation is one long vector operation;
 the library routines for (n, p, p) stacks are several times slower here.
 """
+from dataclasses import fields
+
 import numpy as np
 
 
@@ -95,3 +97,19 @@ def sandwich_2x2(jacobian, covariance):
     return np.stack([a * a * xx + 2 * a * b * xy + b * b * yy,
                      a * c * xx + (a * d + b * c) * xy + b * d * yy,
                      c * c * xx + 2 * c * d * xy + d * d * yy])
+
+
+def is_definite_2x2(covariance):
+    """Return which of the matrices (3, n) are positive definite."""
+    xx, xy, yy = covariance
+    with np.errstate(invalid='ignore'):
+        return (xx > 0) & (yy > 0) & (xx * yy - xy * xy > 1e-12 * xx * yy)
+
+
+class Summed:
+    """A dataclass of arrays, of which two are added field by field."""
+
+    def __add__(self, other):
+        return type(self)(*(getattr(self, field.name)
+                            + getattr(other, field.name)
+                            for field in fields(self)))

@@ -1,23 +1,13 @@
 """The tables of a solution, with the Gaia catalogue's column names."""
-from dataclasses import replace
-
 import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss.motions.joint import (
-    CHUNK,
-    cross_covariance,
-    parallax_leak,
-    parts,
-    solve_all,
-)
-from photutils_mgauss.motions.loop import data_chi2, measured, prior_rank
-from photutils_mgauss.motions.references import FIXED
+from photutils_mgauss.motions.joint import solve_all
+from photutils_mgauss.motions.loop import measured
+from photutils_mgauss.motions.propagation import FROM_OURS
 from photutils_mgauss.motions.stacked import invert_2x2
-from photutils_mgauss.sky.observers import tdb
 from photutils_mgauss.sky.tangent_plane import directions
-from photutils_mgauss.utils.parallel import map_parallel
 
 # What each bit of a star's flags means.
 FLAGS = {
@@ -41,7 +31,6 @@ FLAGS = {
           'motion; the star was not used to tie the frames'),
 }
 GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
-FROM_OURS = [0, 1, 4, 2, 3]  # position, parallax, motion
 STRONG = 0.3
 
 
@@ -64,96 +53,9 @@ def visibility_periods(years, used):
     return count
 
 
-def at_epoch(fit, year, stars):
-    """
-    Return parameters (p, k) and covariances of stars at a Julian year.
-
-    Positions are plane coordinates, no longer relative to an origin.
-    """
-    move = _shift_in_time(fit, year)
-    values = move @ fit.estimates.values[:, stars]
-    values[:2] += fit.scene.origin[:, stars]
-    half = np.tensordot(move, fit.estimates.covariance[..., stars], axes=1)
-    return values, np.einsum('ijn,kj->ikn', half, move)
-
-
-def _parameters(fit, year):
-    """
-    Return parameters (p, n) and covariances of all stars, in local axes.
-
-    In parts, since the matrices that turn the axes are as large as the
-    covariances themselves.
-    """
-    plane = fit.scene.sightings.plane
-    values = np.empty_like(fit.estimates.values)
-    covariance = np.empty_like(fit.estimates.covariance)
-    for start in range(0, values.shape[1], CHUNK):
-        some = slice(start, start + CHUNK)
-        moved = at_epoch(fit, year, some)
-        if plane is not None:
-            moved = turned(plane, *moved)
-        values[:, some], covariance[..., some] = moved
-    return values, covariance
-
-
-def _shift_in_time(fit, year):
-    """Return the matrix from parameters at the working epoch to a year."""
-    dt = year - fit.scene.working_year
-    move = np.eye(fit.problem.n_parameters)
-    move[0, 2] = move[1, 3] = dt
-    if fit.scene.options.acceleration:
-        move[0, -2] = move[1, -1] = dt**2 / 2
-        move[2, -2] = move[3, -1] = dt
-    return move
-
-
-def _inverse_2x2(matrix):
-    (a, b), (c, d) = matrix
-    return np.stack([np.stack([d, -b]), np.stack([-c, a])]) / (a * d - b * c)
-
-
-def turned(plane, values, covariance):
-    """
-    Return values and covariances in local axes instead of the plane's.
-
-    The position stays in plane coordinates, its covariance turns.
-    """
-    turn = _turns(plane, values[:2], len(values))
-    moved = np.einsum('ijn,jn->in', turn, values)
-    moved[:2] = values[:2]
-    half = np.einsum('ijn,jkn->ikn', turn, covariance)
-    return moved, np.einsum('ijn,kjn->ikn', half, turn)
-
-
-def _turns(plane, places, size):
-    """Return the matrices (p, p, n) from the plane's axes to local ones."""
-    inverse = _inverse_2x2(plane.local_jacobian(places))
-    turn = np.zeros((size, size, places.shape[1]))
-    turn[np.arange(size), np.arange(size)] = 1.0
-    for k in [0, 2] + [size - 2] * (size > 5):
-        turn[k:k + 2, k:k + 2] = inverse
-    return turn
-
-
-def star_covariance(fit, stars, ref_year):
-    """Return covariances (k, p, k, p) in Gaia's order, at an epoch."""
-    problem = fit.problem.select(stars)
-    covariance = cross_covariance(problem, fit.frames.factor)
-    size = problem.n_parameters
-    change = np.repeat(_shift_in_time(fit, ref_year)[None], len(stars), 0)
-    plane = fit.scene.sightings.plane
-    if plane is not None:
-        places = at_epoch(fit, ref_year, stars)[0][:2]
-        change = _turns(plane, places, size).transpose(2, 0, 1) @ change
-    covariance = np.einsum('kij,kjlm,lnm->kiln', change, covariance, change)
-    order = [k for k in FROM_OURS if k < size] if (
-        fit.scene.options.parallax) else [0, 1, 2, 3]
-    return covariance[:, order][:, :, :, order]
-
-
 def validation_table(fit, stars):
     """Return held-out references beside their catalogue values."""
-    sightings, held = fit.scene.sightings, fit.scene.held
+    sightings, held = fit.setup.sightings, fit.setup.held
     unit = u.Unit(sightings.unit) / u.yr
     motion, covariance = _catalogue_motions(sightings, held)
     rows = stars[held]
@@ -176,35 +78,33 @@ def validation_table(fit, stars):
 
 def _catalogue_motions(sightings, stars):
     """Return catalogue motions (2, k) and covariances in local axes."""
-    motion = np.zeros((2, len(stars)))
-    covariance = np.zeros((2, 2, len(stars)))
-    if sightings.catalogue is None:
-        return motion, covariance
     place = {star: k for k, star in enumerate(sightings.references)}
-    which = [place[star] for star in stars]
-    catalogue = sightings.catalogue
-    motion = catalogue.motion()[:, which]
-    moves = ~np.isin(catalogue.kinds[which], FIXED)
-    covariance = catalogue.covariance[2:4, 2:4][..., which] * moves
+    catalogue = sightings.catalogue.select([place[star] for star in stars])
+    motion = catalogue.motion()
+    covariance = catalogue.covariance[2:4, 2:4] * ~catalogue.fixed
     if sightings.plane is not None:
-        turn = _inverse_2x2(sightings.plane.local_jacobian(
-            catalogue.values[:2, which]))
+        turn = sightings.plane.local_inverse(catalogue.values[:2])
         turn = np.where(np.isfinite(turn), turn, np.eye(2)[..., None])
         motion = np.einsum('ijn,jn->in', turn, motion)
         covariance = np.einsum('ijn,jkn,lkn->iln', turn, covariance, turn)
     return motion, covariance
 
 
-def star_table(fit, ref_year):
-    """Return the `~astropy.table.QTable` of the stars."""
-    sightings = fit.scene.sightings
+def star_table(fit, ref_year, parameters):
+    """
+    Return the `~astropy.table.QTable` of the stars.
+
+    ``parameters`` are their values (p, n) and covariances (p, p, n) at
+    ``ref_year``, see `~photutils_mgauss.motions.propagation.propagated`.
+    """
+    sightings = fit.setup.sightings
     flags, solved = _flags(fit)
     table = QTable({'id': sightings.names})
-    _add_parameters(table, fit, ref_year, solved)
+    _add_parameters(table, fit, parameters, solved)
     table['ref_epoch'] = np.full(len(table), ref_year) * u.yr
     _add_quality(table, fit, solved)
-    if not fit.scene.options.parallax and sightings.plane is not None:
-        flags |= _add_leak(table, fit, solved)
+    if fit.leak is not None:
+        flags |= _add_leak(table, fit.leak, solved)
     table['flux'] = _mean_flux(sightings.flux)
     table['reference'] = _reference_kinds(fit)
     table['flags'] = flags
@@ -212,22 +112,21 @@ def star_table(fit, ref_year):
     return table
 
 
-def _add_parameters(table, fit, ref_year, solved):
-    unit = u.Unit(fit.scene.sightings.unit)
-    values, covariance = _parameters(fit, ref_year)
+def _add_parameters(table, fit, parameters, solved):
+    unit = u.Unit(fit.setup.sightings.unit)
+    values, covariance = parameters
     values[:, ~solved] = np.nan
     covariance[..., ~solved] = np.nan
-    has_parallax = bool(fit.scene.options.parallax)
+    has_parallax = bool(fit.setup.options.parallax)
     values, covariance, extra = _gaia_order(values, covariance, has_parallax,
-                                            fit.scene.options.acceleration)
+                                            fit.setup.options.acceleration)
     sigma = [np.sqrt(covariance[k][k]) for k in range(5)]
     units = (unit, unit, unit, unit / u.yr, unit / u.yr)
-    plane = fit.scene.sightings.plane
-    if plane is not None:
-        ra, dec = directions(plane.deproject(np.stack(values[:2])))
-        table['ra'], table['dec'] = ra * u.deg, dec * u.deg
-    else:
-        table['x'], table['y'] = (value * unit for value in values[:2])
+    names, scale = (('ra', 'dec'), u.deg)
+    if fit.setup.sightings.plane is None:
+        names, scale = ('x', 'y'), unit
+    for name, value in zip(names, values, strict=False):
+        table[name] = value * scale
     for k, name in enumerate(GAIA):
         if k > 1:
             table[name] = values[k] * units[k]
@@ -260,16 +159,14 @@ def _gaia_order(values, covariance, has_parallax, acceleration):
 
 def _flags(fit):
     """Return flags (n,) and which stars have a solution."""
-    sightings, state = fit.scene.sightings, fit.state
+    sightings, state = fit.setup.sightings, fit.state
     seen = sightings.matches.seen
     finite = np.isfinite(sightings.places).all(axis=0)
     solved = np.isfinite(fit.estimates.values).all(axis=0)
     periods = visibility_periods(sightings.years, state.used)
-    known = np.zeros(len(solved), dtype=bool)
-    known[fit.problem.priors.stars] = prior_rank(fit.problem.priors) > 1
-    solved &= (periods > 1) | (known & (periods > 0))
+    solved &= (periods > 1) | ((fit.ranks > 1) & (periods > 0))
     stars = np.arange(len(solved))
-    relative = fit.scene.relative and fit.scene.transform.kind != 'none'
+    relative = fit.setup.relative and fit.setup.transform.kind != 'none'
     marks = {
         1: ~solved,
         2: (finite & ~sightings.usable).any(axis=0),
@@ -277,7 +174,7 @@ def _flags(fit):
         8: (sightings.usable & ~state.used).any(axis=0),
         16: sightings.matches.ambiguous,
         32: np.isin(stars, state.dropped),
-        64: np.isin(stars, fit.scene.held),
+        64: np.isin(stars, fit.setup.held),
         512: state.untied,
         256: np.full(len(solved), relative),
     }
@@ -285,46 +182,29 @@ def _flags(fit):
 
 
 def _add_quality(table, fit, solved):
-    sightings, state = fit.scene.sightings, fit.state
+    sightings, state = fit.setup.sightings, fit.state
     used = state.used.sum(axis=0)
-    chi2 = data_chi2(fit.estimates, fit.problem)
-    rank = np.zeros(len(used), dtype=int)
-    priors = fit.problem.priors
-    if len(priors.stars):
-        rank[priors.stars] = prior_rank(priors)
-        chi2[priors.stars] += priors.chi2(fit.estimates.values)
-    dof = (2 * used + rank - fit.problem.n_parameters).astype(float)
+    dof = (2 * used + fit.ranks - fit.problem.n_parameters).astype(float)
     tested = solved & (dof > 0)
     table['n_obs'] = sightings.matches.seen.sum(axis=0)
     table['n_good_obs'] = used
     table['visibility_periods_used'] = visibility_periods(sightings.years,
                                                           state.used)
-    table['chi2'] = np.where(tested, chi2, np.nan)
+    table['chi2'] = np.where(tested, fit.chi2, np.nan)
     table['dof'] = np.where(tested, dof, np.nan)
     with np.errstate(invalid='ignore', divide='ignore'):
         table['uwe'] = np.sqrt(table['chi2'] / table['dof'])
 
 
-def _add_leak(table, fit, solved):
+def _add_leak(table, leak, solved):
     """Add what an ignored parallax does to the motion; return its flag."""
-    problem = replace(fit.problem, observer=fit.scene.observer)
-    leaks = map_parallel(_local_leak, parts(problem),
-                         executor=fit.scene.options.executor)
-    correlation, leak = (np.concatenate(some, axis=-1)
-                         for some in zip(*leaks, strict=True))
+    correlation, bias = leak
     strongest = np.where(solved, np.abs(correlation).max(axis=0), np.nan)
     table['parallax_motion_corr'] = strongest
     for k, name in enumerate(('pmra', 'pmdec')):
-        table[f'{name}_per_parallax'] = np.where(solved, leak[k],
+        table[f'{name}_per_parallax'] = np.where(solved, bias[k],
                                                  np.nan) / u.yr
     return 128 * (np.nan_to_num(strongest) > STRONG).astype(int)
-
-
-def _local_leak(problem):
-    """Return correlations (2, n) and leaks (2, n) in local axes."""
-    correlation, leak = parallax_leak(problem)
-    inverse = _inverse_2x2(problem.plane.local_jacobian(problem.origin))
-    return correlation, np.einsum('ijn,jn->in', inverse, leak)
 
 
 def _mean_flux(flux):
@@ -334,38 +214,37 @@ def _mean_flux(flux):
 
 
 def _reference_kinds(fit):
-    sightings, scene = fit.scene.sightings, fit.scene
+    sightings, setup = fit.setup.sightings, fit.setup
     out = np.full(len(sightings.names), '', dtype='U8')
-    seen = sightings.references >= 0
-    kinds = 'qso' if sightings.catalogue is None else (
-        sightings.catalogue.kinds[seen])
-    out[sightings.references[seen]] = kinds
-    out[scene.held] = ''
+    out[sightings.references] = sightings.catalogue.kinds
+    out[setup.held] = ''
     out[fit.state.dropped] = ''
     return out
 
 
 def alignment_table(fit, wcs_residuals):
     """Return the `~astropy.table.QTable` of the epochs' maps."""
-    scene, state = fit.scene, fit.state
-    sightings, transform = scene.sightings, scene.transform
+    setup, state = fit.setup, fit.state
+    sightings, transform = setup.sightings, setup.transform
     unit = u.Unit(sightings.unit)
     centre = np.array(transform.centre)[:, None]
     shift, slope, errors = [], [], []
     for e, coefficients in enumerate(state.maps):
         shift.append(_whole_shift(transform, coefficients, centre,
-                                  sightings.ties[e]))
+                                  sightings.ties.maps[e]))
         slope.append(_whole_slope(transform, coefficients, centre,
-                                  sightings.ties[e]))
+                                  sightings.ties.maps[e]))
         errors.append(_shift_errors(fit, e))
+    counts = _counts(fit)
     table = QTable()
     table['epoch'] = np.arange(len(state.maps))
-    table['time'] = tdb(sightings.epoch_years)
+    table['time'] = sightings.times
     table['shift'] = np.array(shift) * unit
     table['shift_error'] = np.array(errors) * unit
     table['matrix'] = np.array(slope)
     table['coefficients'] = state.maps * unit
-    _add_counts(table, fit, unit)
+    for name, values in counts.items():
+        table[name] = values
     floor = np.broadcast_to(state.floor.T, (2, len(state.maps))).T
     table['systematic'] = np.sqrt(floor) * unit
     table['wcs_residual'] = np.array(wcs_residuals) * u.mas
@@ -389,23 +268,24 @@ def _whole_slope(transform, coefficients, centre, tie):
 
 def _shift_errors(fit, e):
     """Return the errors of a map's shift at the centre of the field."""
-    b = fit.scene.transform.n_terms
+    b = fit.setup.transform.n_terms
     covariance = fit.frames.covariance(e)
     return np.sqrt(np.diag(covariance)[[0, b]])
 
 
-def _add_counts(table, fit, unit):
-    scene, state = fit.scene, fit.state
-    sightings = scene.sightings
-    stars = scene.anchors.copy()
+def _counts(fit):
+    """Return the references used and rejected, and their rms, by name."""
+    setup, state = fit.setup, fit.state
+    sightings = setup.sightings
+    stars = setup.anchors.copy()
     stars[state.dropped] = False
     used = state.used & stars
-    table['n_references'] = used.sum(axis=1)
-    lost = sightings.usable & ~state.used & scene.anchors
+    lost = sightings.usable & ~state.used & setup.anchors
     lost |= sightings.usable & np.isin(np.arange(len(stars)), state.dropped)
-    table['n_rejected'] = lost.sum(axis=1)
-    table['rms'] = [_rms(fit.estimates.residuals[:, e, used[e]])
-                    for e in range(len(used))] * unit
+    rms = [_rms(fit.estimates.residuals[:, e, used[e]])
+           for e in range(len(used))]
+    return {'n_references': used.sum(axis=1), 'n_rejected': lost.sum(axis=1),
+            'rms': rms * u.Unit(sightings.unit)}
 
 
 def _rms(residuals):
@@ -418,13 +298,13 @@ def _rms(residuals):
 
 def residual_table(fit):
     """Return the `~astropy.table.QTable` of all detections."""
-    scene, sightings = fit.scene, fit.scene.sightings
+    setup, sightings = fit.setup, fit.setup.sightings
     epoch, star = np.nonzero(sightings.matches.seen)
     at = (epoch, star)
     full = solve_all(fit.problem, fit.frames.correction, fit.frames.factor,
-                     scene.options.executor, residuals=True, leverage=True,
+                     setup.options.executor, residuals=True, leverage=True,
                      judge=True)
-    covariance = np.stack([measured(scene, fit.state, e)
+    covariance = np.stack([measured(setup, fit.state, e)
                            for e in range(len(fit.state.maps))], axis=1)
     unit = u.Unit(sightings.unit)
     finite = np.isfinite(sightings.places).all(axis=0)
@@ -445,8 +325,8 @@ def residual_table(fit):
 
 
 def _add_aligned(table, fit, at, unit):
-    scene, sightings = fit.scene, fit.scene.sightings
-    aligned = np.stack([scene.transform.apply(one, sightings.places[:, e])
+    setup, sightings = fit.setup, fit.setup.sightings
+    aligned = np.stack([setup.transform.apply(one, sightings.places[:, e])
                         for e, one in enumerate(fit.state.maps)], axis=1)
     if sightings.plane is not None:
         ra, dec = directions(sightings.plane.deproject(aligned))

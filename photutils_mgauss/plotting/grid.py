@@ -43,8 +43,8 @@ def plot_node_map(ax, psf, column='size_error', *, layout=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same; its title tells median and scatter (1.4826 MAD) of the
-        nodes that are not bridged.
+        The same; its title tells median and scatter
+        (`~astropy.stats.mad_std`) of the nodes that are not bridged.
 
     Raises
     ------

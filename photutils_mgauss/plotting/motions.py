@@ -107,10 +107,8 @@ def plot_motion_errors(ax, stars, magnitude):
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
-    stars : `~astropy.table.QTable`
-        As `~photutils_mgauss.MotionSolution.stars`.
+    ax, stars : `~matplotlib.axes.Axes`, `~astropy.table.QTable`
+        As for `plot_proper_motions`.
     magnitude : (n,) array_like
         A magnitude for each.
 

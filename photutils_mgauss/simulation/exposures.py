@@ -37,6 +37,12 @@ from numpy.polynomial import chebyshev, polynomial
 
 from photutils_mgauss.simulation.instrument import Band
 from photutils_mgauss.simulation.mock_psf import band_of
+from photutils_mgauss.sky.observers import add_aberration
+from photutils_mgauss.sky.tangent_plane import (
+    directions,
+    local_axes,
+    unit_vectors,
+)
 from photutils_mgauss.utils.validation import as_floats, as_real
 
 _LIGHT_SPEED = 299792.458 * u.km / u.s
@@ -59,15 +65,10 @@ _CUBIC = np.add(*np.indices((4, 4))) <= 3
 NGP = (192.8595, 27.1283)  # the field of the paper [deg]
 
 
-def directions(sources, time):
+def source_vectors(sources, time):
     """Return the geocentric directions (3, n) of sources at a time."""
-    ra, dec = (np.radians(_degrees(sources, name)) for name in ('ra', 'dec'))
-    zero = np.zeros_like(ra)
-    radial = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra),
-                       np.sin(dec)])
-    east = np.stack([-np.sin(ra), np.cos(ra), zero])
-    north = np.stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra),
-                      np.cos(dec)])
+    radial = unit_vectors(*(_degrees(sources, name) for name in ('ra', 'dec')))
+    east, north = local_axes(radial)
     earth = earth_at(time)[0]
     years = (time.tdb.jyear - _column(sources, 'ref_epoch', u.yr, 2016.0)
              + earth @ radial * _LIGHT_YEARS)
@@ -99,21 +100,6 @@ def earth_at(time):
                                                   ephemeris='builtin')
     return (place.xyz.to_value(u.au),
             (velocity.xyz / _LIGHT_SPEED).to_value(u.one))
-
-
-def aberrate(vectors, beta):
-    r"""
-    Return directions (3, n) as an observer of velocity beta (3,) sees them.
-
-    With :math:`\gamma = (1 - \beta^2)^{-1/2}` and the unit vector
-    :math:`\mathbf{s}`, Lorentz's transformation gives a direction along
-    :math:`\mathbf{s} / \gamma + \boldsymbol\beta\,[1 + \mathbf{s} \cdot
-    \boldsymbol\beta / (1 + 1 / \gamma)]`.
-    """
-    inverse = np.sqrt(1 - beta @ beta)
-    share = 1 + (beta @ vectors) / (1 + inverse)
-    seen = inverse * vectors + np.multiply.outer(beta, share)
-    return seen / np.linalg.norm(seen, axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,10 +211,8 @@ class Exposure:
 
         Parameters
         ----------
-        shape : (ny, nx) tuple of int
-            The pixels of the image.
-        pixel_scale : float
-            The nominal side of a pixel [arcsec].
+        shape, pixel_scale : tuple of int, float
+            As for `wcs`.
 
         Returns
         -------
@@ -245,10 +229,8 @@ class Exposure:
         sources : `~astropy.table.QTable`
             With the columns ``ra`` and ``dec`` and optionally ``pmra``,
             ``pmdec``, ``parallax`` and ``ref_epoch`` (2016 by default).
-        shape : (ny, nx) tuple of int
-            The pixels of the image.
-        pixel_scale : float
-            The nominal side of a pixel [arcsec].
+        shape, pixel_scale : tuple of int, float
+            As for `wcs`.
 
         Returns
         -------
@@ -260,13 +242,14 @@ class Exposure:
         ValueError
             If a column is missing.
         """
-        vectors = directions(sources, self.time)
+        vectors = source_vectors(sources, self.time)
         if self.aberration:
             # The telescope points at the displaced centre, so that only the
             # difference over the field is left.
             beta = earth_at(self.time)[1]
-            centre = aberrate(self._axes[:1].T, beta)[:, 0]
-            vectors = _turn(aberrate(vectors, beta), centre, self._axes[0])
+            centre = add_aberration(self._axes[0], beta)
+            vectors = _turn(add_aberration(vectors, beta), centre,
+                            self._axes[0])
         return _Geometry(self, tuple(shape), pixel_scale).pixels(vectors)
 
     @property
@@ -476,12 +459,5 @@ def paper_exposures(ra=NGP[0], dec=NGP[1], *, offset=3.0, rotation=0.05,
 def _shifted(exposure, east, north):
     """Point an exposure elsewhere; the offsets are on the plane [deg]."""
     vector = exposure._axes.T @ [1, np.radians(east), np.radians(north)]
-    ra, dec = sky_of(vector)
+    ra, dec = directions(vector)
     return replace(exposure, ra=float(ra), dec=float(dec))
-
-
-def sky_of(vectors):
-    """Return right ascension in [0, 360) and declination [deg]."""
-    x, y, z = vectors
-    return (np.degrees(np.arctan2(y, x)) % 360,
-            np.degrees(np.arctan2(z, np.hypot(x, y))))

@@ -127,7 +127,7 @@ class Optics:
         Parameters
         ----------
         x, y : float
-            The place [pix].
+            As for `aberrations`.
 
         Returns
         -------

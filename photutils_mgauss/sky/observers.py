@@ -7,6 +7,7 @@ astropy.
 import warnings
 
 import astropy.units as u
+import erfa
 import numpy as np
 from astropy.coordinates import (
     CartesianDifferential,
@@ -15,7 +16,6 @@ from astropy.coordinates import (
     get_body_barycentric_posvel,
 )
 from astropy.time import Time
-from erfa import ErfaWarning
 
 LIGHT = 173.1446326846693  # speed of light [au / day]
 # The Sun-Earth L2 point lies this fraction of an Earth orbit further out:
@@ -36,7 +36,7 @@ def julian_years(time, name='time'):
         with warnings.catch_warnings():
             # UTC after the last announced leap second is uncertain by a
             # second, which no proper motion can notice.
-            warnings.simplefilter('ignore', ErfaWarning)
+            warnings.simplefilter('ignore', erfa.ErfaWarning)
             years = np.ma.filled(time.tdb.jyear, np.nan)
     else:
         years = _plain_years(time, name)
@@ -154,6 +154,18 @@ def observer_position(observer, years):
     return xyz[:, where.reshape(years.shape)]
 
 
+def observer_positions(observers, years):
+    """
+    Return barycentric positions (3, E, ...) [au] of E observers.
+
+    ``years`` (E, ...) are Julian years; unknown ones (NaN) count as the mean
+    of the others.
+    """
+    return np.stack([
+        observer_position(observer, np.nan_to_num(row, nan=np.nanmean(row)))
+        for observer, row in zip(observers, years, strict=True)], axis=1)
+
+
 def observer_velocity(observer):
     """Return the observer's velocity (3,) in units of light, or None."""
     if (not isinstance(observer, CartesianRepresentation)
@@ -164,20 +176,16 @@ def observer_velocity(observer):
 
 
 def add_aberration(vectors, velocity):
-    r"""
-    Return directions seen by an observer who moves with ``velocity``.
-
-    For unit vectors :math:`u` and :math:`\beta = v/c`, with
-    :math:`\gamma = (1 - \beta^2)^{-1/2}`,
-
-    .. math::
-        u' \propto u / \gamma
-        + \left(1 + \frac{u\cdot\beta}{1 + 1/\gamma}\right) \beta .
     """
-    beta = np.asarray(velocity).reshape((3,) + (1,) * (vectors.ndim - 1))
-    along = np.sum(vectors * beta, axis=0)
+    Return directions (3, ...) seen by an observer who moves.
+
+    ``velocity`` (3,) is in units of light. Light is not bent by the Sun on
+    its way: catalogues have removed that.
+    """
+    velocity = np.asarray(velocity)
     rest = np.sqrt(1 - np.sum(np.square(velocity)))
-    seen = vectors * rest + (1 + along / (1 + rest)) * beta
+    seen = erfa.ab(np.moveaxis(vectors, 0, -1), velocity, np.inf, rest)
+    seen = np.moveaxis(seen, -1, 0)
     return seen / np.sqrt(np.sum(seen**2, axis=0))
 
 

@@ -90,6 +90,12 @@ class TangentPlane:
         return np.stack([self.displacement(plane, tangent)
                          for tangent in axes], axis=1)
 
+    def local_inverse(self, plane):
+        """Return the (2, 2, ...) matrix from plane to local displacements."""
+        (a, b), (c, d) = self.local_jacobian(plane)
+        return np.stack([np.stack([d, -b]),
+                         np.stack([-c, a])]) / (a * d - b * c)
+
     def displacement(self, plane, shift):
         r"""
         Return the plane displacement for a small ``shift`` of the vectors.

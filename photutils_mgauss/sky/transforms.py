@@ -166,6 +166,22 @@ def fit_map(transform, points, targets, weights):
     return np.linalg.lstsq(basis.T, values.T, rcond=None)[0].T
 
 
+def fit_linear(transform, points, targets):
+    """
+    Fit the map (2, 3) of points to targets, in coordinates not scaled.
+
+    Polynomials become affine.
+    """
+    if transform.kind == 'polynomial':
+        transform = Transform('affine')
+    transform = transform.fitted_to(points)
+    coefficients = fit_map(transform, points, targets,
+                           np.ones(points.shape[1]))
+    slope = coefficients[:, 1:3] / transform.scale
+    start = coefficients[:, 0] - slope @ np.array(transform.centre)
+    return np.column_stack([start, slope])
+
+
 def _fit_shape(transform, points, targets, weights):
     """Fit a shift, rotation or similarity (Procrustes' problem)."""
     total = weights.sum()

@@ -29,14 +29,11 @@ from helpers.motion_scenes import (
     pulls,
 )
 from photutils_mgauss import Epoch, ProperMotionFitter
-from photutils_mgauss.motions.frames import Gauge, solve_frames
-from photutils_mgauss.motions.joint import (
-    Priors,
-    Problem,
-    reduce_all,
-    solve_all,
-)
+from photutils_mgauss.motions.frames import solve_frames
+from photutils_mgauss.motions.joint import reduce_all, solve_all
 from photutils_mgauss.motions.matching import Tolerance, match_positions
+from photutils_mgauss.motions.priors import Priors
+from photutils_mgauss.motions.problem import MotionProblem
 from photutils_mgauss.sky.observers import observer_position
 from photutils_mgauss.sky.tangent_plane import TangentPlane
 from photutils_mgauss.sky.transforms import Transform
@@ -317,11 +314,11 @@ def make_problem(n, *, transform, parallax, seed=1):
     precision = np.zeros((p, p, len(quasars)))
     precision[range(2, p), range(2, p)] = 1e8
     zero = np.zeros((p, len(quasars)))
-    return Problem(offsets, weights, origin, dt,
-                   observer if parallax else None, plane,
-                   Transform.parse(transform).fitted_to(origin),
-                   Priors(quasars, precision, zero, zero[0]), False,
-                   np.ones(n, dtype=bool))
+    return MotionProblem(offsets, weights, origin, dt,
+                         observer if parallax else None, plane,
+                         Transform.parse(transform).fitted_to(origin),
+                         Priors(quasars, precision, zero, zero[0]), False,
+                         np.ones(n, dtype=bool))
 
 
 def cpu(function):
@@ -331,9 +328,7 @@ def cpu(function):
 
 
 def solve_jointly(problem):
-    gauge = Gauge.of(problem.transform, problem.dt[:, 0])
-    frames = solve_frames(reduce_all(problem, OneThread), problem.transform,
-                          gauge)
+    frames = solve_frames(problem, reduce_all(problem, OneThread))
     return solve_all(problem, frames.correction, frames.factor, OneThread)
 
 

@@ -1,4 +1,5 @@
 """Motions of what cannot be fitted: an error, or a flag for one star."""
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import Table
@@ -193,3 +194,14 @@ def test_wrong_identifiers_of_half_the_stars_do_no_harm(rng, transform):
     assert rms(away - design @ field) < 0.01
     wrong = fit.stars[fit.stars['id'] >= 50]
     assert np.mean(wrong['flags'] & 512 > 0) > 0.9
+
+
+def test_epochs_in_pixels_take_a_radius_and_systematic_errors_in_pixels(rng):
+    epochs, motion = plane_epochs(rng)
+    for epoch in epochs:
+        epoch.table.remove_column('id')
+    stars = ProperMotionFitter(
+        transform='shift', match_radius=2 * u.pix,
+        systematic=0.001 * u.pix).fit(epochs).stars
+    assert len(stars) == motion.shape[1]
+    assert str(stars['pmra'].unit) == 'pix / yr'

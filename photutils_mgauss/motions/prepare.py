@@ -1,0 +1,239 @@
+"""All that stays the same while a fit of motions iterates, made once."""
+from dataclasses import dataclass
+
+import astropy.units as u
+import numpy as np
+
+from photutils_mgauss.motions.assemble import Sightings
+from photutils_mgauss.motions.priors import (
+    Priors,
+    add_parallax_prior,
+    build_priors,
+)
+from photutils_mgauss.motions.references import perspective
+from photutils_mgauss.sky.transforms import Transform
+
+
+@dataclass(frozen=True, eq=False)
+class Options:
+    """What the fitter was asked for, checked; see `ProperMotionFitter`."""
+
+    transform: Transform
+    recipe: str
+    parallax: object
+    parallax_prior: tuple
+    acceleration: bool
+    systematic: object
+    clip: float | None
+    max_motion: u.Quantity
+    hold_out: float
+    eps_t: str
+    rng: object
+    executor: object
+
+    @property
+    def n_star_parameters(self):
+        """Number of parameters of a star."""
+        return 4 + bool(self.parallax) + 2 * self.acceleration
+
+    @property
+    def fits_floor(self):
+        """Whether the systematic errors are found from the scatter."""
+        return isinstance(self.systematic, str)
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """
+    Everything that stays the same while the fit iterates.
+
+    Parameters
+    ----------
+    sightings : `~photutils_mgauss.motions.assemble.Sightings`
+    options : `Options`
+    transform : `~photutils_mgauss.sky.transforms.Transform`
+        The kind of map, with coordinates that suit the field.
+    origin : (2, n) `~numpy.ndarray`
+        Mean places of the stars.
+    working_year : float
+    dt : (E, 1) or (E, n) `~numpy.ndarray`
+        Years since then.
+    priors : `~photutils_mgauss.motions.priors.Priors`
+        Those of all references in use.
+    anchors : (n,) bool `~numpy.ndarray`
+        Stars that say where the frames are: the references of known motion,
+        or without any all stars.
+    held : (k,) int `~numpy.ndarray`
+        References held out.
+    relative : bool
+        Whether there are no references, and all stars are anchors.
+    drift : (stars, displacements) or None
+        Known displacements (2, E, k) of k references beyond the model.
+    typical_variance : float
+        Median variance of the detections, 1 if there are none.
+    """
+
+    sightings: Sightings
+    options: Options
+    transform: Transform
+    origin: np.ndarray
+    working_year: float
+    dt: np.ndarray
+    priors: Priors
+    anchors: np.ndarray
+    held: np.ndarray
+    relative: bool
+    drift: tuple | None
+    typical_variance: float
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """
+    What changes from one iteration to the next.
+
+    ``maps`` (E, 2, b), ``used`` (E, n), ``floor`` (E,) variances per axis,
+    ``dropped`` (k,) stars that are references no longer, ``untied`` (n,)
+    stars whose detections disagree too much to find the frames with.
+    """
+
+    maps: np.ndarray
+    used: np.ndarray
+    floor: np.ndarray
+    dropped: np.ndarray
+    untied: np.ndarray
+
+
+def prepare(sightings, options):
+    """Return the `Setup` of a fit, and the `State` it starts from."""
+    _check_parallax(options, sightings)
+    floor = _first_floor(options.systematic, sightings)
+    stars, catalogue = sightings.references, sightings.catalogue
+    held = _hold_out(stars, options)
+    anchors = np.zeros(len(sightings.names), dtype=bool)
+    anchors[stars[catalogue.kinds != 'position']] = True
+    anchors[held] = False
+    relative = not anchors.any()
+    if relative:
+        anchors[:] = True
+    working = float(np.nanmean(sightings.epoch_years))
+    dt = np.nan_to_num(sightings.years - working)
+    untied = _scattered(sightings, anchors, options.max_motion)
+    _check_references(sightings, anchors, untied, relative, options.transform)
+    origin, transform = _field(sightings, options.transform)
+    drift = _drift(sightings, origin, dt, options)
+    use = ~np.isin(stars, held)
+    priors = build_priors(catalogue.select(use), stars[use],
+                          origin[:, stars[use]], working, sightings.unit,
+                          options.n_star_parameters)
+    if options.parallax == 'prior':
+        priors = add_parallax_prior(priors, len(anchors),
+                                    options.parallax_prior)
+    variance = sightings.covariance[0][sightings.usable]
+    maps = np.repeat(transform.identity()[None], len(dt), axis=0)
+    return (Setup(sightings, options, transform, origin, working, dt, priors,
+                  anchors, held, relative, drift,
+                  np.median(variance) if variance.size else 1.0),
+            State(maps, sightings.usable.copy(), floor,
+                  np.empty(0, dtype=int), untied))
+
+
+def _check_parallax(options, sightings):
+    if options.parallax and options.recipe == 'paper':
+        msg = ("parallax must be False for the recipe 'paper', got "
+               f'{options.parallax!r}')
+        raise ValueError(msg)
+    if options.parallax and sightings.plane is None:
+        msg = ('parallax must be False for epochs without a place in the '
+               f'sky, got {options.parallax!r}')
+        raise ValueError(msg)
+
+
+def _first_floor(systematic, sightings):
+    n_epochs = len(sightings.epoch_years)
+    if systematic is None or isinstance(systematic, str):
+        return np.zeros(n_epochs)
+    floor = np.asarray(systematic.to_value(u.Unit(sightings.unit)))
+    if floor.shape not in ((), (n_epochs,)):
+        msg = (f'systematic must be one value or one per epoch '
+               f'({n_epochs}), got shape {floor.shape}')
+        raise ValueError(msg)
+    return np.broadcast_to(floor**2, n_epochs).copy()
+
+
+def _hold_out(stars, options):
+    n = round(options.hold_out * len(stars))
+    if n == 0:
+        return np.empty(0, dtype=int)
+    rng = np.random.default_rng(options.rng)
+    return np.sort(rng.choice(stars, n, replace=False))
+
+
+def _scattered(sightings, anchors, max_motion):
+    """
+    Return stars (n,) whose places are too far apart to be one star.
+
+    Identifiers may be wrong, and one such star would outweigh all others.
+    """
+    places = np.where(sightings.usable, sightings.places, np.nan)
+    count = sightings.usable.sum(axis=0)
+    many = np.flatnonzero(count > 1)
+    spread = np.zeros(len(count))
+    spread[many] = (np.nanmax(places[..., many], axis=1)
+                    - np.nanmin(places[..., many], axis=1)).max(axis=0)
+    typical = spread[anchors & (count > 1)]
+    limit = 30 * np.median(typical) if len(typical) else 0.0
+    if sightings.unit == 'mas':
+        baseline = np.ptp(sightings.epoch_years) * u.yr
+        limit = max(limit, (max_motion * baseline).to_value(u.mas))
+    return (spread > limit) | ~sightings.ties.agreed
+
+
+def _check_references(sightings, anchors, untied, relative, transform):
+    """Raise where an epoch has fewer references than its map needs."""
+    if transform.kind == 'none':
+        return
+    need = transform.n_references
+    usable = sightings.usable & anchors & ~untied
+    if relative:
+        usable = usable & (usable.sum(axis=0) > 1)
+    counts = usable.sum(axis=1)
+    if (counts < need).any():
+        e = int(np.argmin(counts))
+        what = ('stars in common with other epochs' if relative
+                else 'reference objects')
+        if (untied & anchors).any():
+            what += ' whose places agree'
+        msg = (f'epoch {e} must have at least {need} {what} for the '
+               f'transform {transform.kind!r}, got {counts[e]}')
+        raise ValueError(msg)
+
+
+def _field(sightings, transform):
+    """Return the stars' mean places, and the maps' coordinates for them."""
+    count = np.isfinite(sightings.places[0]).sum(axis=0)
+    with np.errstate(invalid='ignore'):
+        origin = (np.nansum(sightings.places, axis=1)
+                  / np.where(count, count, np.nan))
+    transform = transform.fitted_to(origin)
+    return np.where(np.isfinite(origin), origin,
+                    np.reshape(transform.centre, (2, 1))), transform
+
+
+def _drift(sightings, origin, dt, options):
+    """
+    Return references and their displacements beyond the model, or None.
+
+    Known parallaxes where none are fitted, and perspective acceleration.
+    """
+    stars, catalogue = sightings.references, sightings.catalogue
+    years = dt if dt.shape[1] == 1 else dt[:, stars]
+    out = perspective(catalogue)[:, None, :] * years**2 / 2
+    if sightings.plane is not None and not options.parallax:
+        observer = sightings.observer
+        if observer.shape[2] > 1:
+            observer = observer[..., stars]
+        parallax = np.nan_to_num(catalogue.values[4])
+        out = out + parallax * sightings.plane.parallax_factors(
+            origin[:, None, stars], observer)
+    return (stars, out) if np.any(out) else None

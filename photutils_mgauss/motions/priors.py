@@ -1,0 +1,139 @@
+"""What is known of some stars before anything is measured, as equations."""
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from photutils_mgauss.motions.references import FIXED, UNKNOWN
+from photutils_mgauss.motions.stacked import apply
+
+# "Zero" motion and parallax of a quasar, in units of the frame's own: an
+# exact zero would make the equations singular.
+ZERO = {'mas': 1e-4, 'pix': 1e-6}
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """
+    What is known of k of the stars beforehand, as normal equations.
+
+    Parameters
+    ----------
+    stars : (k,) int `~numpy.ndarray`
+        Sorted numbers of the stars.
+    precision : (p, p, k) `~numpy.ndarray`
+        Inverse covariance of the parameters, 0 where nothing is known.
+    moment : (p, k) `~numpy.ndarray`
+        The precision times the expected parameters, positions relative to
+        the star's origin. (The expected parameters themselves do not exist
+        where the precision is singular.)
+    constant : (k,) `~numpy.ndarray`
+        The chi-square of parameters that are all zero.
+    """
+
+    stars: np.ndarray
+    precision: np.ndarray
+    moment: np.ndarray
+    constant: np.ndarray
+
+    @classmethod
+    def none(cls, n_parameters):
+        """Return priors of no star at all."""
+        p = n_parameters
+        return cls(np.empty(0, dtype=int), np.empty((p, p, 0)),
+                   np.empty((p, 0)), np.empty(0))
+
+    def pick(self, which, stars=None):
+        """Return some of the priors, for ``stars`` or the same ones."""
+        stars = self.stars[which] if stars is None else stars
+        return Priors(stars, self.precision[..., which],
+                      self.moment[:, which], self.constant[which])
+
+    def chi2(self, values):
+        """Return the chi-square (k,) of parameters (p, n) of all stars."""
+        v = values[:, self.stars]
+        return (np.sum(v * (apply(self.precision, v) - 2 * self.moment),
+                       axis=0) + self.constant)
+
+    @cached_property
+    def rank(self):
+        """Number of parameters (k,) each prior knows."""
+        return np.linalg.matrix_rank(np.moveaxis(self.precision, 2, 0),
+                                     hermitian=True)
+
+    def between(self, start, stop):
+        """Return the priors of stars start <= i < stop, renumbered."""
+        part = slice(*np.searchsorted(self.stars, [start, stop]))
+        return self.pick(part, self.stars[part] - start)
+
+    def without(self, stars):
+        """Return the priors of all stars but these."""
+        return self.pick(~np.isin(self.stars, stars))
+
+
+def build_priors(catalogue, stars, origin, year, unit, n_parameters):
+    """
+    Return the `Priors` of references with the numbers ``stars``.
+
+    ``origin`` (2, k) are the places their positions are relative to, and
+    ``year`` the working epoch. ``n_parameters`` is 4, 5 (parallax), 6 or 7
+    (acceleration, about which catalogues say nothing).
+    """
+    has_parallax = n_parameters % 2 == 1
+    size = 5 if has_parallax else 4
+    k = len(stars)
+    precision = np.zeros((n_parameters, n_parameters, k))
+    moment = np.zeros((n_parameters, k))
+    constant = np.zeros(k)
+    zero = ZERO[unit]
+    for i in range(k):
+        matrix, covariance, value = _known(catalogue, i, origin[:, i], year,
+                                           zero, size)
+        weighted = np.linalg.solve(covariance, matrix)
+        precision[:size, :size, i] = matrix.T @ weighted
+        moment[:size, i] = value @ weighted
+        constant[i] = value @ np.linalg.solve(covariance, value)
+    order = np.argsort(stars)
+    return Priors(np.asarray(stars), precision, moment,
+                  constant).pick(order)
+
+
+def _known(catalogue, i, origin, year, zero, size):
+    """
+    Return what is known of reference i: matrix M, covariance and values.
+
+    The catalogue's values are M v for the parameters v at the working
+    epoch; rows without an error are left out.
+    """
+    value = catalogue.values[:, i].copy()
+    covariance = catalogue.covariance[..., i].copy()
+    matrix = np.eye(5)
+    if np.isfinite(catalogue.year[i]):
+        matrix[0, 2] = matrix[1, 3] = catalogue.year[i] - year
+    value[:2] -= origin
+    if catalogue.kinds[i] in FIXED:
+        value[2:] = 0
+        covariance[2:] = covariance[:, 2:] = 0
+        covariance[[2, 3, 4], [2, 3, 4]] = zero**2
+    if catalogue.kinds[i] == 'position':
+        value[2:] = np.nan
+    known = np.isfinite(value) & (np.diag(covariance) < 1e-3 * UNKNOWN)
+    known = np.flatnonzero(known[:size])
+    return (matrix[known, :size], covariance[np.ix_(known, known)],
+            value[known])
+
+
+def add_parallax_prior(priors, n_stars, parallax):
+    """Give stars of unknown ``parallax`` its expected mean and sigma."""
+    mean, sigma = parallax
+    p = len(priors.precision)
+    precision, moment = np.zeros((p, p, n_stars)), np.zeros((p, n_stars))
+    constant = np.zeros(n_stars)
+    precision[..., priors.stars] = priors.precision
+    moment[:, priors.stars] = priors.moment
+    constant[priors.stars] = priors.constant
+    free = precision[4, 4] == 0
+    precision[4, 4, free] = sigma**-2
+    moment[4, free] = mean / sigma**2
+    constant[free] += mean**2 / sigma**2
+    return Priors(np.arange(n_stars), precision, moment, constant)

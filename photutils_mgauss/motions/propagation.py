@@ -1,0 +1,91 @@
+"""Positions, motions and their covariances at any epoch, in local axes."""
+import numpy as np
+
+from photutils_mgauss.motions.joint import cross_covariance
+from photutils_mgauss.motions.problem import CHUNK
+from photutils_mgauss.sky.tangent_plane import directions
+
+FROM_OURS = [0, 1, 4, 2, 3]  # to Gaia's order: position, parallax, motion
+
+
+def propagated(fit, year):
+    """
+    Return parameters (p, n) and covariances of all stars, in local axes.
+
+    In parts, since the matrices that turn the axes are as large as the
+    covariances themselves.
+    """
+    plane = fit.setup.sightings.plane
+    values = np.empty_like(fit.estimates.values)
+    covariance = np.empty_like(fit.estimates.covariance)
+    for start in range(0, values.shape[1], CHUNK):
+        some = slice(start, start + CHUNK)
+        moved = at_epoch(fit, year, some)
+        if plane is not None:
+            moved = turned(plane, *moved)
+        values[:, some], covariance[..., some] = moved
+    return values, covariance
+
+
+def at_epoch(fit, year, stars):
+    """
+    Return parameters (p, k) and covariances of stars at a Julian year.
+
+    Positions are plane coordinates, no longer relative to an origin.
+    """
+    move = _shift_in_time(fit, year)
+    values = move @ fit.estimates.values[:, stars]
+    values[:2] += fit.setup.origin[:, stars]
+    half = np.tensordot(move, fit.estimates.covariance[..., stars], axes=1)
+    return values, np.einsum('ijn,kj->ikn', half, move)
+
+
+def _shift_in_time(fit, year):
+    """Return the matrix from parameters at the working epoch to a year."""
+    dt = year - fit.setup.working_year
+    move = np.eye(fit.problem.n_parameters)
+    move[0, 2] = move[1, 3] = dt
+    if fit.setup.options.acceleration:
+        move[0, -2] = move[1, -1] = dt**2 / 2
+        move[2, -2] = move[3, -1] = dt
+    return move
+
+
+def turned(plane, values, covariance):
+    """
+    Return values and covariances in local axes instead of the plane's.
+
+    The position becomes right ascension and declination [deg], its
+    covariance turns.
+    """
+    turn = _turns(plane, values[:2], len(values))
+    moved = np.einsum('ijn,jn->in', turn, values)
+    moved[:2] = directions(plane.deproject(values[:2]))
+    half = np.einsum('ijn,jkn->ikn', turn, covariance)
+    return moved, np.einsum('ijn,kjn->ikn', half, turn)
+
+
+def _turns(plane, places, size):
+    """Return the matrices (p, p, n) from the plane's axes to local ones."""
+    inverse = plane.local_inverse(places)
+    turn = np.zeros((size, size, places.shape[1]))
+    turn[np.arange(size), np.arange(size)] = 1.0
+    for k in [0, 2] + [size - 2] * (size > 5):
+        turn[k:k + 2, k:k + 2] = inverse
+    return turn
+
+
+def star_covariance(fit, stars, ref_year):
+    """Return covariances (k, p, k, p) in Gaia's order, at an epoch."""
+    problem = fit.problem.select(stars)
+    covariance = cross_covariance(problem, fit.frames.factor)
+    size = problem.n_parameters
+    change = np.repeat(_shift_in_time(fit, ref_year)[None], len(stars), 0)
+    plane = fit.setup.sightings.plane
+    if plane is not None:
+        places = at_epoch(fit, ref_year, stars)[0][:2]
+        change = _turns(plane, places, size).transpose(2, 0, 1) @ change
+    covariance = np.einsum('kij,kjlm,lnm->kiln', change, covariance, change)
+    order = [k for k in FROM_OURS if k < size] if (
+        fit.setup.options.parallax) else [0, 1, 2, 3]
+    return covariance[:, order][:, :, :, order]

@@ -1,0 +1,305 @@
+"""What a fit of proper motions found: motions, frames, and their errors."""
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+
+from photutils_mgauss.motions.bootstrap import bootstrap_frames
+from photutils_mgauss.motions.corrected_wcs import correct_epochs
+from photutils_mgauss.motions.loop import Fit, measured_alone
+from photutils_mgauss.motions.propagation import (
+    propagated,
+    star_covariance,
+)
+from photutils_mgauss.motions.tables import (
+    FLAGS,
+    alignment_table,
+    residual_table,
+    star_table,
+    validation_table,
+)
+from photutils_mgauss.sky.observers import julian_years, tdb
+from photutils_mgauss.utils.validation import as_integer
+
+
+def decode_motion_flags(flags):
+    """
+    Return the sentences the flags of a star stand for.
+
+    Parameters
+    ----------
+    flags : int
+        A value of the column ``flags`` of `MotionSolution.stars`.
+
+    Returns
+    -------
+    list of str
+
+    Examples
+    --------
+    >>> from photutils_mgauss import decode_motion_flags
+    >>> decode_motion_flags(8)
+    ['outlier: a detection was rejected as an outlier']
+    """
+    return [sentence for bit, sentence in FLAGS.items()
+            if int(flags) & bit]
+
+
+def solution_of(result, ref_epoch=None):
+    """
+    Return the `MotionSolution` of a `Fit`.
+
+    ``ref_epoch`` is the Julian year of the positions; the default is the
+    fit's own.
+    """
+    year = result.setup.working_year if ref_epoch is None else ref_epoch
+    parameters = propagated(result, year)
+    corrected, residuals = correct_epochs(result)
+    return MotionSolution(
+        star_table(result, year, parameters), corrected,
+        alignment_table(result, residuals),
+        result.frames.undetermined + result.setup.sightings.notes, result)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSolution:
+    """
+    Proper motions, and the frames they were measured in.
+
+    Parameters
+    ----------
+    stars : `~astropy.table.QTable`
+        One row per star, with the Gaia catalogue's column names: ``ra``,
+        ``dec`` [deg] (``x``, ``y`` for planes without sky), ``parallax``
+        [mas], ``pmra`` (with the cosine of the declination in it) and
+        ``pmdec`` [mas / yr], an ``_error`` for each, the ten ``_corr``,
+        ``ref_epoch`` (Julian year, TDB), ``n_obs``, ``n_good_obs``,
+        ``visibility_periods_used``, ``chi2``, ``dof``, ``uwe``, ``flags``
+        (see `decode_motion_flags`).
+    epochs : list of `Epoch`
+        The epochs given, with corrected WCS.
+    alignment : `~astropy.table.QTable`
+        One row per epoch: the map's shift and matrix, its coefficients,
+        the references used and rejected, the rms of their residuals, and
+        the systematic error found.
+    notes : tuple of str
+        What the data could not determine, and which epochs have few stars
+        in common with the others, in sentences.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import (
+    ...     Epoch, Instrument, ProperMotionFitter, paper_exposures,
+    ...     simulate_catalogues, sky_field)
+    >>> sources = sky_field(30, 20, size=0.3, magnitudes=(20, 23),
+    ...                     parallaxes=False, separation=0.5, rng=1)
+    >>> epochs = [Epoch(one.table, one.wcs, one.time)
+    ...           for one in simulate_catalogues(
+    ...               sources, paper_exposures()[::3], rng=2,
+    ...               instrument=Instrument(shape=(400, 400)))]
+    >>> quasars = list(sources['id'][sources['kind'] == 'qso'])
+    >>> solution = ProperMotionFitter(references=quasars).fit(epochs)
+    >>> solution
+    <MotionSolution: 50 of 50 stars, 3 epochs>
+    >>> solution.stars['pmra', 'pmra_error', 'pmra_pmdec_corr'].colnames
+    ['pmra', 'pmra_error', 'pmra_pmdec_corr']
+    >>> solution.residuals['epoch', 'dra', 'ddec'].colnames
+    ['epoch', 'dra', 'ddec']
+
+    Positions at another time, with the errors of then:
+
+    >>> later = solution.at(2030.0)
+    >>> bool((later['ra_error'] > solution.stars['ra_error']).all())
+    True
+    """
+
+    stars: QTable
+    epochs: list
+    alignment: QTable
+    notes: tuple
+    _fit: Fit = field(repr=False)
+
+    def __repr__(self):
+        solved = int(np.isfinite(self.stars['pmra']).sum())
+        return (f'<MotionSolution: {solved} of {len(self.stars)} stars, '
+                f'{len(self.epochs)} epochs>')
+
+    @cached_property
+    def residuals(self):
+        """
+        One row per detection, as a `~astropy.table.QTable`.
+
+        The aligned position, its residual towards east and north, what the
+        residual would be had the detection not been used, and its
+        chi-square (of two degrees of freedom, leverage taken into account).
+        """
+        return residual_table(self._fit)
+
+    @property
+    def sky(self):
+        """
+        The stars as a `~astropy.coordinates.SkyCoord` with motions.
+
+        ICRS, at the reference epoch; None for planes without sky.
+        """
+        if 'ra' not in self.stars.colnames:
+            return None
+        return SkyCoord(self.stars['ra'], self.stars['dec'],
+                        pm_ra_cosdec=self.stars['pmra'],
+                        pm_dec=self.stars['pmdec'], frame='icrs',
+                        obstime=tdb(self.stars['ref_epoch'][0].value))
+
+    def at(self, time):
+        """
+        Return the stars at another epoch, with the covariances of then.
+
+        Parameters
+        ----------
+        time : `~astropy.time.Time` or float
+            The new reference epoch.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            Like ``stars``. Positions move along straight lines on the
+            tangent plane, which are great circles; their errors grow away
+            from the epochs observed, as the correlations say.
+        """
+        return _stars_at(self._fit, float(julian_years(time)))
+
+    def covariance(self, ids):
+        """
+        Return the covariances within and between some stars.
+
+        Parameters
+        ----------
+        ids : (k,) array_like
+            Identifiers of at most some hundred stars.
+
+        Returns
+        -------
+        (k, p, k, p) `~numpy.ndarray`
+            For the p parameters ``ra``, ``dec``, ``parallax`` (if fitted),
+            ``pmra`` and ``pmdec`` at the reference epoch [mas, mas / yr].
+            What two stars share is the error of the frames.
+
+        Raises
+        ------
+        ValueError
+            If a star is unknown, or motions are relative.
+        """
+        if self._fit.setup.relative:
+            msg = ('references must be given for covariances between '
+                   'stars, got relative motions')
+            raise ValueError(msg)
+        stars = _numbers_of(np.atleast_1d(ids), self.stars['id'])
+        return star_covariance(self._fit, stars, self._year)
+
+    def validation(self):
+        """
+        Compare the references held out with their catalogue.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            ``id``, ``dpmra`` and ``dpmdec`` (measured minus catalogue),
+            their errors, those of the catalogue included, and ``chi2`` of
+            two degrees of freedom.
+        """
+        return validation_table(self._fit, self.stars)
+
+    def bootstrap(self, n_resamples=10000, *, rng=None):
+        """
+        Resample the reference objects to see the error of the frames.
+
+        Parameters
+        ----------
+        n_resamples : int, optional
+            Number of resamplings.
+        rng : `~numpy.random.Generator` or int, optional
+            Source of the random draws.
+
+        Returns
+        -------
+        draws : object
+            ``draws.shift`` (n_resamples, E, 2) is the change of each map
+            at the centre of the field [mas], ``draws.motion``
+            (n_resamples, 2) that of all motions in common [mas / yr].
+
+        Raises
+        ------
+        TypeError, ValueError
+            If ``n_resamples`` is not a positive integer.
+        """
+        n = as_integer(n_resamples, 'n_resamples', minimum=1)
+        return bootstrap_frames(self._fit, n, rng)
+
+    def plot_residuals(self, ax, epoch):
+        """
+        Draw the residuals of one epoch as arrows.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`
+            Where to draw, and what is returned.
+        epoch : int
+            Number of the epoch, from 0.
+
+        Returns
+        -------
+        `~matplotlib.axes.Axes`
+        """
+        from photutils_mgauss.plotting import plot_residual_vectors
+        return plot_residual_vectors(ax, self, epoch)
+
+    def plot_motions(self, ax):
+        """
+        Plot the proper-motion diagram.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`
+            Where to draw, and what is returned.
+
+        Returns
+        -------
+        `~matplotlib.axes.Axes`
+        """
+        from photutils_mgauss.plotting import plot_proper_motions
+        return plot_proper_motions(ax, self.stars)
+
+    @property
+    def _year(self):
+        return float(self.stars['ref_epoch'][0].value)
+
+    def measured(self):
+        """
+        Return the stars as the detections alone have them.
+
+        The same table as ``stars``, in the same frames, but without what the
+        catalogue says of each reference object: for comparing the two.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            With the rows and columns of ``stars``.
+        """
+        return _stars_at(measured_alone(self._fit), self._year)
+
+
+def _stars_at(result, year):
+    """Return the table of a fit's stars at a Julian year."""
+    return star_table(result, year, propagated(result, year))
+
+
+def _numbers_of(ids, names):
+    """Return the rows of identifiers in a column."""
+    names = np.asarray(names)
+    missing = ~np.isin(ids, names)
+    if missing.any():
+        msg = f'ids must be those of stars, got {ids[missing][0]!r}'
+        raise ValueError(msg)
+    order = np.argsort(names)
+    return order[np.searchsorted(names, ids, sorter=order)]
