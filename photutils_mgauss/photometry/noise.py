@@ -19,6 +19,12 @@ from photutils.utils import calc_total_error
 
 from photutils_mgauss import kernels
 from photutils_mgauss.photometry.engine import cut_boxes, psf_arrays
+from photutils_mgauss.utils.image import (
+    read_level,
+    read_quantity,
+    read_values,
+    with_unit,
+)
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = ['CramerRao', 'cramer_rao', 'pixel_error']
@@ -106,12 +112,13 @@ def pixel_error(light, *, sky=0, read_noise=0, gain=1, exposure_time=None):
     >>> pixel_error([[0.0, 3.0]], sky=0.96, read_noise=2, exposure_time=100)
     array([[0.1, 0.2]])
     """
-    light = as_floats(light, 'light', finite=False)
+    light, unit = read_quantity(light, 'light')
+    sky = read_values(sky, 'sky', unit)
     background = background_error(sky=sky, read_noise=read_noise, gain=gain,
                                   exposure_time=exposure_time)
     background = np.broadcast_to(background, light.shape)
-    return calc_total_error(light, background,
-                            _electrons(gain, exposure_time))
+    return with_unit(calc_total_error(light, background,
+                                      _electrons(gain, exposure_time)), unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +130,8 @@ class CramerRao:
     ----------
     covariance : (n, 3, 3) `~numpy.ndarray`
         Of flux, x and y of each star.
+    unit : `~astropy.units.UnitBase` or None
+        Of the flux.
 
     Examples
     --------
@@ -136,11 +145,12 @@ class CramerRao:
     """
 
     covariance: np.ndarray
+    unit: object = None
 
     @property
     def flux_err(self):
         """The errors of the fluxes, (n,)."""
-        return np.sqrt(self.covariance[:, 0, 0])
+        return with_unit(np.sqrt(self.covariance[:, 0, 0]), self.unit)
 
     @property
     def x_err(self):
@@ -209,19 +219,20 @@ def cramer_rao(psf, flux, sky=0, *, x=0, y=0, read_noise=0, gain=1,
     >>> bound.x_err
     array([0.01 , 0.001])
     """
-    flux, x, y = (np.atleast_1d(a).astype(float) for a in
-                  np.broadcast_arrays(as_floats(flux, 'flux'),
-                                      as_floats(x, 'x'), as_floats(y, 'y')))
-    level = background_error(sky=as_real(sky, 'sky', minimum=0),
+    flux, unit = read_quantity(flux, 'flux')
+    flux, x, y = (np.atleast_1d(a).astype(float) for a in np.broadcast_arrays(
+        as_floats(flux, 'flux'), as_floats(x, 'x'), as_floats(y, 'y')))
+    sky = as_real(read_level(sky, 'sky', unit), 'sky', minimum=0)
+    level = background_error(sky=sky,
                              read_noise=read_noise, gain=gain,
                              exposure_time=exposure_time)
     noise = level**2, _electrons(gain, exposure_time)
     jets = _Jets(psf, x, y, as_shape(fit_shape, 'fit_shape'))
     if jointly:
-        return CramerRao(_joint_bound(jets, flux, noise, free_sky))
+        return CramerRao(_joint_bound(jets, flux, noise, free_sky), unit)
     return CramerRao(np.array([
         _bound(jets.own(i), flux[i], noise, free_sky)
-        for i in range(x.size)]))
+        for i in range(x.size)]), unit)
 
 
 class _Jets:

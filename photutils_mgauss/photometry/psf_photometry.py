@@ -24,6 +24,8 @@ from photutils_mgauss.photometry import table as _table
 from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
 from photutils_mgauss.photometry.result import FitInfo, FitResult
 from photutils_mgauss.utils import compat
+from photutils_mgauss.utils.image import read_pixels, with_unit
+from photutils_mgauss.utils.star_columns import plain_values
 from photutils_mgauss.utils.validation import as_choice, as_real
 
 __all__ = ['MixturePSFPhotometry']
@@ -152,12 +154,17 @@ class MixturePSFPhotometry(PSFPhotometry):
         `~astropy.table.QTable` or None
             The table of results; None if there are no stars.
         """
+        if isinstance(data, NDData):
+            compat.check_nddata(mask, error)
+        pixels = read_pixels(data, error, mask)
+        data, error = (array if array is None
+                       else with_unit(array, pixels.unit)
+                       for array in (pixels.data, pixels.error))
+        mask = pixels.mask
         if not self._can_fit:
             return super().__call__(data, mask=mask, error=error,
                                     init_params=init_params)
         compat.reset(self)
-        if isinstance(data, NDData):
-            data, mask, error = compat.split_nddata(data, mask, error)
         data, mask, error, init_params = compat.prepare_inputs(
             self, data, mask, error, init_params)
         if init_params is None:
@@ -285,9 +292,9 @@ class _Start:
 
     def __init__(self, photometry, image, init_params):
         self.initial = np.column_stack(
-            [_table.plain(init_params[f'{name}_init'])
+            [plain_values(init_params[f'{name}_init'])
              for name in ('flux', 'x', 'y')])
-        self.local_bkg = _table.plain(init_params['local_bkg'])
+        self.local_bkg = plain_values(init_params['local_bkg'])
         self.free = photometry._free
         self._set_bounds(photometry)
         self._set_boxes(photometry.fit_shape, image)

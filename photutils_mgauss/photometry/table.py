@@ -1,6 +1,5 @@
 """Tables and flags of PSF photometry, as photutils makes them."""
 import numpy as np
-from astropy.units import Quantity
 
 from photutils_mgauss.utils import compat
 
@@ -21,14 +20,6 @@ OUTSIDE_FIT_REGION = 4096
 
 # How near a bound is near, in the unit of the parameter.
 _BOUND_TOLERANCE = 0.01
-
-
-def plain(column):
-    """Return a column as a plain array without unit, NaN where masked."""
-    values = np.array(column.value if isinstance(column, Quantity)
-                      else column, dtype=float)
-    values[getattr(column, 'mask', False)] = np.nan
-    return values
 
 
 def define_flags(result, fit_shape, data_shape):
