@@ -230,19 +230,20 @@ class CrowdedMixturePhotometry:
 
         Parameters
         ----------
-        data : (ny, nx) array_like, `~astropy.units.Quantity` or \
-                `~astropy.nddata.NDData`
-            The image.
+        data : (ny, nx) array_like or NDData
+            The image. Its own mask counts, its unit comes back: see
+            :ref:`pixels`.
         mask : (ny, nx) array_like of bool, optional
-            True for pixels to leave out; pixels that are not finite, or
-            whose error is not positive, are left out, too.
-        error : (ny, nx) array_like, optional
-            The standard deviation of each pixel. By default it is estimated,
-            one number for the image.
+            True for pixels to leave out. Masks of ``data`` and ``error``
+            count, too; pixels that are not finite, or whose error is not
+            positive, are left out as well.
+        error : float or (ny, nx) array_like, optional
+            The standard deviation of each pixel in the unit of ``data``. By
+            default it is estimated, one number for the image.
         init_params : `~astropy.table.Table`, optional
-            Positions ``x_init``, ``y_init`` and, if known, ``flux_init`` of
-            the stars to report. None is added, none left out, and the result
-            has their order.
+            Positions ``x_init``, ``y_init`` (or ``x``, ``y``, ...) and, if
+            known, ``flux_init`` of the stars to report. None is added, none
+            left out, and the result has their order.
 
         Returns
         -------
@@ -359,7 +360,7 @@ class CrowdedMixturePhotometry:
 
         Parameters
         ----------
-        data : (ny, nx) array_like
+        data : (ny, nx) array_like or NDData
             The image.
         psf_shape, include_local_bkg
             See `make_model_image`.
@@ -460,8 +461,9 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     ----------
     photometry : CrowdedMixturePhotometry
         How the image is reduced.
-    data : (ny, nx) array_like
-        The image.
+    data : (ny, nx) array_like or NDData
+        The image. Its own mask counts, its unit comes back: see
+        :ref:`pixels`.
     flux : (n,) array_like or (low, high) tuple of float
         The fluxes of the stars of one repeat, or limits between which they
         are drawn evenly in the logarithm, as many as there is room for.

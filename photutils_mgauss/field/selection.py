@@ -34,16 +34,18 @@ def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
 
     Parameters
     ----------
-    data : (ny, nx) array_like
-        The image, its background subtracted.
+    data : (ny, nx) array_like or NDData
+        The image, its background subtracted. Its own mask counts, its unit
+        comes back: see :ref:`pixels`.
     sources : `~astropy.table.Table`, optional
         A catalogue with ``x``, ``y`` (or ``x_fit``, ``x_centroid``, ...) and
         perhaps ``flux``. By default sources are detected.
-    error : (ny, nx) array_like, optional
-        The standard deviation of each pixel; by default the scatter of the
-        image.
+    error : float or (ny, nx) array_like, optional
+        The standard deviation of each pixel in the unit of ``data``; by
+        default the scatter of the image.
     mask : (ny, nx) array_like of bool, optional
-        True for pixels that cannot be used.
+        True for pixels that cannot be used. Masks of ``data`` and ``error``
+        count, too.
     fwhm : float, optional
         The width of stars [pix] for their detection, 3 by default.
     threshold : float, optional

@@ -190,9 +190,10 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
 
     Parameters
     ----------
-    image : (ny, nx) or (n, ny, nx) array_like
+    image : (ny, nx) or (n, ny, nx) array_like or NDData
         The PSF sampled at pixel centres; it contains the pixel or not as the
-        mixture will. Negative wings are normal and not clipped.
+        mixture will. Negative wings are normal and not clipped. Its own mask
+        counts, its unit comes back: see :ref:`pixels`.
     n_components : int, optional
         The number K of Gaussians.
     oversampling : int or (y, x) tuple of int, optional
@@ -201,10 +202,12 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
         The image pixel that is the origin of the means. None is the middle,
         (n - 1) / 2.
     error : float or array_like, optional
-        The standard deviation of the pixels, broadcast to the image. None
-        gives all pixels the same weight.
+        The standard deviation of the pixels in the unit of ``image``,
+        broadcast to it; positive where pixels are not masked. None gives all
+        pixels the same weight.
     mask : array_like of bool, optional
-        True for pixels to leave out, broadcast to the image.
+        True for pixels to leave out, broadcast to the image. Masks of
+        ``image`` and ``error`` count, too.
     radius : float, optional
         Use only pixels with centres within this distance [native pix] of the
         image's peak, which is found to a fraction of a pixel.

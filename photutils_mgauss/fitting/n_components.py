@@ -22,7 +22,7 @@ def compare_n_components(image, n_components=(1, 2, 3, 4, 5), **kwargs):
 
     Parameters
     ----------
-    image : (ny, nx) array_like
+    image : (ny, nx) array_like or NDData
         See `fit_mixture`.
     n_components : sequence of int, optional
         The numbers K to try.
@@ -117,7 +117,7 @@ def select_n_components(image, n_components=(1, 2, 3, 4, 5), *,
 
     Parameters
     ----------
-    image : (ny, nx) array_like
+    image : (ny, nx) array_like or NDData
         See `fit_mixture`.
     n_components : sequence of int, optional
         The numbers K to try.

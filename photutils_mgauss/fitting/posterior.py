@@ -210,7 +210,7 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
 
     Parameters
     ----------
-    image : (ny, nx) array_like
+    image : (ny, nx) array_like or NDData
         See `fit_mixture`.
     n_components : int, optional
         The number K of Gaussians.

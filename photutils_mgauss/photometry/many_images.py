@@ -129,11 +129,11 @@ def fit_many(images, coordinates, *, fit_shape=11, common_flux=False):
     Parameters
     ----------
     images : sequence of (data, psf, wcs)
-        ``data`` is a (ny, nx) array, or an `~astropy.nddata.NDData` with its
-        ``uncertainty`` and ``mask``; ``psf`` a `GriddedMixturePSF`,
-        `MultiGaussianPSFModel` or `MixtureField`; ``wcs`` a gwcs or
-        `astropy.wcs.WCS` with celestial axes. The units of data, if any, are
-        to be the same.
+        ``data`` is a (ny, nx) array_like, or an NDData with its uncertainty;
+        its own mask counts, its unit comes back: see :ref:`pixels`. ``psf``
+        is a `GriddedMixturePSF`, `MultiGaussianPSFModel` or `MixtureField`;
+        ``wcs`` a gwcs or `astropy.wcs.WCS` with celestial axes. The units of
+        data, if any, are to be the same.
     coordinates : (n,) `~astropy.coordinates.SkyCoord`
         Where the stars are, to a pixel or so.
     fit_shape : int or (ny, nx) tuple of int, optional

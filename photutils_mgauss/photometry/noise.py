@@ -79,11 +79,12 @@ def pixel_error(light, *, sky=0, read_noise=0, gain=1, exposure_time=None):
 
     Parameters
     ----------
-    light : (ny, nx) array_like
+    light : (ny, nx) array_like or NDData
         The light above the sky: the image itself, as in the paper, or a model
         of it. Errors from the image are too small where noise made a pixel
         faint, and weighted fluxes come out low; with a model they do not.
-        Negative light counts as none.
+        Negative light counts as none. The error of a masked pixel is NaN, a
+        unit comes back: see :ref:`pixels`.
     sky : float or (ny, nx) array_like, optional
         The level of the sky, in the unit of the image.
     read_noise : float, optional
@@ -95,7 +96,7 @@ def pixel_error(light, *, sky=0, read_noise=0, gain=1, exposure_time=None):
 
     Returns
     -------
-    (ny, nx) `~numpy.ndarray`
+    (ny, nx) `~numpy.ndarray` or `~astropy.units.Quantity`
         Standard deviations in the unit of the image, by
         `photutils.utils.calc_total_error`.
 
@@ -183,7 +184,7 @@ def cramer_rao(psf, flux, sky=0, *, x=0, y=0, read_noise=0, gain=1,
     psf : GaussianMixture, GriddedMixturePSF or MultiGaussianPSFModel
         The PSF. A mixture is taken to contain the pixel.
     flux : (n,) array_like
-        The total fluxes, in the unit of the image.
+        The total fluxes, in the unit of the image. A unit comes back.
     sky : float, optional
         The level of the sky, in the unit of the image.
     x, y : (n,) array_like, optional

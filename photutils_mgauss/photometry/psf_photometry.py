@@ -137,14 +137,14 @@ class MixturePSFPhotometry(PSFPhotometry):
 
         Parameters
         ----------
-        data : (ny, nx) array_like, `~astropy.units.Quantity` or \
-                `~astropy.nddata.NDData`
-            The image, background subtracted.
+        data : (ny, nx) array_like or NDData
+            The image, its background subtracted. Its own mask counts, its
+            unit comes back: see :ref:`pixels`.
         mask : (ny, nx) array_like of bool, optional
-            True where pixels are to be left out. Pixels that are not finite
-            are left out, too.
-        error : (ny, nx) array_like, optional
-            The standard deviations of the pixels.
+            True for pixels to leave out. Masks of ``data`` and ``error``
+            count, too; pixels that are not finite are left out as well.
+        error : float or (ny, nx) array_like, optional
+            The standard deviation of each pixel in the unit of ``data``.
         init_params : `~astropy.table.Table`, optional
             Where the stars are, as photutils takes it; by default what
             ``finder`` finds.

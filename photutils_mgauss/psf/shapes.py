@@ -82,7 +82,8 @@ class Shapes:
     x, y : float or (n,) `~numpy.ndarray`
         The centre of the matching Gaussian relative to the origin [pix].
     flux : float or (n,) `~numpy.ndarray`
-        The flux of the matching Gaussian.
+        The flux of the matching Gaussian, in the unit of the image if it has
+        one.
     r2_err, e1_err, e2_err, x_err, y_err : float or (n,) `~numpy.ndarray`
         Standard errors; NaN where no errors of pixels were given.
     status : int or (n,) `~numpy.ndarray`
@@ -194,19 +195,23 @@ def adaptive_moments(image, *, oversampling=1, origin=None, error=None,
 
     Parameters
     ----------
-    image : (ny, nx) or (n, ny, nx) array_like, GaussianMixture, or sequence
+    image : (ny, nx) or (n, ny, nx) array_like or NDData, GaussianMixture, or \
+            sequence
         One image or a stack; one mixture or several, which may differ in
-        their number of Gaussians.
+        their number of Gaussians. The own mask of an image counts, its unit
+        comes back: see :ref:`pixels`.
     oversampling : int or (y, x) tuple of int, optional
         Image pixels per native pixel.
     origin : (x, y) array_like, optional
         The image pixel that positions are relative to; None is the middle.
     error : float or array_like, optional
-        The standard deviation of the pixels, broadcast to the image. It gives
-        the errors of the result and does not change the result.
+        The standard deviation of the pixels in the unit of ``image``,
+        broadcast to it; positive where pixels are not masked. It gives the
+        errors of the result and does not change the result.
     mask : array_like of bool, optional
-        True for pixels to leave out. They are filled with the matching
-        Gaussian at each step.
+        True for pixels to leave out, broadcast to the image. They are filled
+        with the matching Gaussian at each step. Masks of ``image`` and
+        ``error`` count, too.
     executor : `~concurrent.futures.Executor`, optional
         Where to measure a stack. None is a pool of threads on all cores.
 

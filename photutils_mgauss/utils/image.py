@@ -140,9 +140,7 @@ def read_quantity(value, name):
 
     The unit of plain numbers is None.
     """
-    if isinstance(value, NDData):
-        value, _ = _from_nddata(value, name)
-    array, mask, unit = _unwrap(value, name)
+    array, mask, unit = _unwrap(_split(value, name)[0], name)
     array = np.array(array, np.float64, order='C')
     if mask is not None:
         array[mask] = np.nan
@@ -184,9 +182,7 @@ def check_errors(error, used):
 # From what a user gives to plain arrays.
 
 def _read(data, error, mask, name, ndims, broadcast):
-    own_error = None
-    if isinstance(data, NDData):
-        data, own_error = _from_nddata(data, name)
+    data, own_error = _split(data, name)
     values, masked, unit = _unwrap(data, name)
     _check_shape(values, name, ndims)
     shape = values.shape
@@ -203,6 +199,22 @@ def _read(data, error, mask, name, ndims, broadcast):
     mask = np.logical_or.reduce(masks) if len(masks) > 1 else (
         masks[0] if masks else None)
     return PixelData(values, error, mask, unit)
+
+
+def _split(data, name):
+    """Return data with masks and units, and the errors that come along."""
+    if isinstance(data, NDData):
+        return _from_nddata(data, name)
+    if isinstance(data, (list, tuple)) and any(
+            isinstance(one, NDData) for one in data):
+        parts = [_split(one, name) for one in data]
+        errors = [error for _, error in parts if error is not None]
+        if len(errors) not in (0, len(parts)):
+            msg = (f'{name} must have an uncertainty in all images or in '
+                   f'none, got {len(errors)} in {len(parts)}')
+            raise ValueError(msg)
+        return [one for one, _ in parts], errors or None
+    return data, None
 
 
 def _from_nddata(nddata, name):
@@ -245,13 +257,12 @@ def _unwrap(value, name):
 
 
 def _has_more(value):
-    return isinstance(value, (Masked, np.ma.MaskedArray, u.Quantity, NDData))
+    return isinstance(value, (Masked, np.ma.MaskedArray, u.Quantity))
 
 
 def _unwrap_list(values, name):
     """Unwrap a list of images, of which each may have a mask and a unit."""
-    parts = [_unwrap(_from_nddata(one, name)[0] if isinstance(one, NDData)
-                     else one, name) for one in values]
+    parts = [_unwrap(one, name) for one in values]
     unit = parts[0][2]
     arrays = [array if own is None and unit is None
               else array * _factor(own, unit, name, 'the first of them')
