@@ -23,7 +23,7 @@ def plot_projection(ax, fit, image, *, axis='x', oversampling=1):
         Where to draw.
     fit : MixtureFit
         The fit.
-    image : (ny, nx) array_like
+    image : (ny, nx) array_like or NDData
         The image that was fitted.
     axis : {'x', 'y'}, optional
         The axis that stays.
@@ -74,7 +74,7 @@ def plot_profile(ax, fit, image):
         Where to draw.
     fit : MixtureFit
         The fit.
-    image : (ny, nx) array_like
+    image : (ny, nx) array_like or NDData
         The image that was fitted.
 
     Returns
@@ -143,7 +143,7 @@ def plot_comparison_of_numbers(axes, image, table):
     ----------
     axes : sequence of `~matplotlib.axes.Axes`
         One more than the table has rows.
-    image : (ny, nx) array_like
+    image : (ny, nx) array_like or NDData
         The image.
     table : `~astropy.table.QTable`
         From `~photutils_mgauss.compare_n_components`.

@@ -9,6 +9,7 @@ any kind. Nothing that a user gives is changed, and an image is copied only
 where the call would have to copy it anyway.
 """
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import astropy.units as u
 import numpy as np
@@ -196,8 +197,7 @@ def _read(data, error, mask, name, ndims, broadcast):
         error = _fit(error, 'error', name, shape, broadcast)
         masks.append(_fit(masked, 'error', name, shape, broadcast))
     masks = [one for one in masks if one is not None]
-    mask = np.logical_or.reduce(masks) if len(masks) > 1 else (
-        masks[0] if masks else None)
+    mask = reduce(np.logical_or, masks) if masks else None
     return PixelData(values, error, mask, unit)
 
 
@@ -221,21 +221,28 @@ def _from_nddata(nddata, name):
     """Return the data with mask and unit, and the error or None."""
     data = with_unit(nddata.data, nddata.unit)
     if nddata.mask is not None:
-        mask = np.broadcast_to(_read_mask(nddata.mask), np.shape(data))
+        mask = _fit(_read_mask(nddata.mask), 'mask', name, np.shape(data),
+                    broadcast=True)
         data = Masked(data, mask)
-    kind = nddata.uncertainty
-    if kind is None:
+    if nddata.uncertainty is None:
         return data, None
+    error = _standard_deviation(nddata.uncertainty, name)
+    return data, with_unit(error.array, error.unit or nddata.unit)
+
+
+def _standard_deviation(uncertainty, name):
+    """Return an uncertainty of any kind as a standard deviation."""
+    if isinstance(uncertainty, StdDevUncertainty):
+        return uncertainty
     try:
         # A pixel of no weight has an infinite error.
         with np.errstate(divide='ignore'):
-            error = kind.represent_as(StdDevUncertainty)
+            return uncertainty.represent_as(StdDevUncertainty)
     except (TypeError, ValueError) as reason:
         msg = (f'{name} must have an uncertainty that is a standard '
                f'deviation, a variance or its inverse, got '
-               f'{type(kind).__name__}')
+               f'{type(uncertainty).__name__}')
         raise ValueError(msg) from reason
-    return data, with_unit(error.array, error.unit or nddata.unit)
 
 
 def _unwrap(value, name):
