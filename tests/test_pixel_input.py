@@ -344,10 +344,10 @@ REFUSED = {
         r'(data|image) must be an array of numbers, got object'),
     'a line': (
         {'data': DATA[0]}, ValueError,
-        r'(data|image) must have shape \(ny, nx\).* got \(43,\)'),
+        r'(data|image) must have (the )?shape \(ny, nx\).* got \(43,\)'),
     'nothing': (
         {'data': DATA[:0]}, ValueError,
-        r'(data|image) must have shape \(ny, nx\).* got \(0, 43\)'),
+        r'(data|image) must have (the )?shape \(ny, nx\).* got \(0, 43\)'),
     'shape of error': (
         {'error': ERROR[:3, :4]}, ValueError,
         r'error must .* shape .*\(41, 43\).* got \(3, 4\)'),

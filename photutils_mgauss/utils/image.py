@@ -305,8 +305,9 @@ def _numbers(value, name):
 
 def _check_shape(array, name, ndims):
     if array.ndim not in ndims or 0 in array.shape:
-        want = ' or '.join(('(ny, nx)', '(n, ny, nx)')[:len(ndims)])
-        msg = f'{name} must have shape {want} and pixels, got {array.shape}'
+        want = ('the shape (ny, nx)' if ndims == (2,)
+                else 'shape (ny, nx) or (n, ny, nx)')
+        msg = f'{name} must have {want} and pixels, got {array.shape}'
         raise ValueError(msg)
 
 
