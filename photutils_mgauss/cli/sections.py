@@ -9,6 +9,7 @@ from photutils_mgauss.cli.page import Panel, Section
 from photutils_mgauss.cli.psf_files import psf_kind, psf_record, read_psf
 from photutils_mgauss.plotting.style import BLACK
 from photutils_mgauss.psf.shapes import adaptive_moments
+from photutils_mgauss.utils.star_columns import column_values
 
 # Nodes that whiskers and maps show along each axis at most.
 _SHOWN = 12
@@ -77,7 +78,8 @@ def catalogue_section(path, table, record):
 
 def _star_facts(table, good):
     """Return the numbers about a catalogue's stars."""
-    flux, error = _plain(table, 'flux_fit'), _plain(table, 'x_err')
+    flux, error = (column_values(table, name)
+                   for name in ('flux_fit', 'x_err'))
     bright = flux >= np.nanpercentile(flux[good], 90) if good.any() else good
     return {'Stars': len(table), 'Without flags': int(good.sum()),
             'Median error of x [pix]': f'{np.nanmedian(error[good]):.4f}',
@@ -87,13 +89,14 @@ def _star_facts(table, good):
 
 def _star_panels(table, good):
     """Return the figures of a catalogue's stars."""
-    flux = _plain(table, 'flux_fit')
+    flux = column_values(table, 'flux_fit')
     unit = getattr(table['flux_fit'], 'unit', None)
     with np.errstate(invalid='ignore', divide='ignore'):
         magnitude = -2.5 * np.log10(flux)
     label = f'-2.5 log flux{"" if unit is None else f" / ({unit})"} [mag]'
-    errors = {name: _plain(table, name)[good] for name in ('x_err', 'y_err')}
-    x, y = _plain(table, 'x_fit'), _plain(table, 'y_fit')
+    errors = {name: column_values(table, name)[good]
+              for name in ('x_err', 'y_err')}
+    x, y = column_values(table, 'x_fit'), column_values(table, 'y_fit')
     panels = [
         Panel(lambda ax: plotting.plot_detections(ax, x, y, flux),
               'The stars, brighter ones larger.'),
@@ -101,7 +104,7 @@ def _star_panels(table, good):
             ax, magnitude[good], errors, unit='pix', label=label),
             'Errors of position against magnitude, of stars without flags.')]
     if 'reduced_chi2' in table.colnames:
-        chi2 = {'reduced chi2': _plain(table, 'reduced_chi2')[good]}
+        chi2 = {'reduced chi2': column_values(table, 'reduced_chi2')[good]}
         panels.append(Panel(
             lambda ax: _chi2(ax, magnitude[good], chi2, label),
             'How well the PSF describes the stars: 1 if noise is all that '
@@ -115,12 +118,6 @@ def _chi2(ax, magnitude, chi2, label):
     ax.axhline(1, color=BLACK, linewidth=0.8)
 
 
-def _plain(table, name):
-    column = table[name]
-    return np.ma.filled(np.ma.asarray(getattr(column, 'value', column),
-                                      dtype=float), np.nan)
-
-
 def _when(record):
     time = record.get('exposure', {}).get('time')
     return {} if time is None else {'Middle of the exposure [Julian year]':
@@ -129,7 +126,7 @@ def _when(record):
 
 def motion_section(path, table, record):
     """Return the section on a table of proper motions."""
-    solved = np.isfinite(_plain(table, 'pmra_error'))
+    solved = np.isfinite(column_values(table, 'pmra_error'))
     unit = table['pmra'].unit
     facts = {'Stars': len(table), 'With proper motions': int(solved.sum())}
     # Files have no empty words, only missing ones.
@@ -138,7 +135,7 @@ def motion_section(path, table, record):
     free = np.asarray(table['reference']) == ''
     facts['References'] = int(np.sum(~free))
     for name in ('pmra', 'pmdec'):
-        values = _plain(table, f'{name}_error')[solved]
+        values = column_values(table, f'{name}_error')[solved]
         if values.size:
             facts[f'Median error of {name} [{unit}]'] = (
                 f'{np.median(values):.3f}')
@@ -153,8 +150,8 @@ def _motion_panels(table, solved, free):
     # The motions of references are what a catalogue says.
     stars = table[solved & free]
     with np.errstate(invalid='ignore', divide='ignore'):
-        magnitude = -2.5 * np.log10(_plain(stars, 'flux'))
-    errors = {name: _plain(stars, f'{name}_error')
+        magnitude = -2.5 * np.log10(column_values(stars, 'flux'))
+    errors = {name: column_values(stars, f'{name}_error')
               for name in ('pmra', 'pmdec')}
     if np.isfinite(magnitude).any():
         panels.append(Panel(
@@ -210,8 +207,9 @@ def residual_section(path, table, record):
 
 def _judged(table):
     """Return which detections are not fitted exactly, as two of a star."""
-    length = np.hypot(_plain(table, 'dra'), _plain(table, 'ddec'))
-    error = np.hypot(_plain(table, 'dra_error'), _plain(table, 'ddec_error'))
+    length, error = (np.hypot(*(column_values(table, f'{axis}{end}')
+                                for axis in ('dra', 'ddec')))
+                     for end in ('', '_error'))
     with np.errstate(invalid='ignore'):
         return np.isfinite(length) & (length > 1e-6 * error)
 

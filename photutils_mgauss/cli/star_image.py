@@ -141,10 +141,7 @@ class StarImage:
     @property
     def electrons(self):
         """The electrons in a unit of the image, or None."""
-        unit, gain = self.unit, self.reading.gain
-        if gain is None:
-            gain = self.layers.cards.gain
-        known = electrons_in_unit(unit, gain,
+        known = electrons_in_unit(self.unit, self._or_header('gain'),
                                   self._or_header('exposure_time'))
         return self.reading.gain if known is None else known
 

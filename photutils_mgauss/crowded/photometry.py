@@ -8,8 +8,7 @@ Galactic bulge.
 import warnings
 
 import numpy as np
-from astropy.nddata import NDData
-from astropy.table import QTable, Table, vstack
+from astropy.table import QTable, vstack
 from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss import kernels
@@ -19,7 +18,8 @@ from photutils_mgauss.crowded.plan import Plan, run
 from photutils_mgauss.crowded.table import REPEATED, StarTable, as_qtable
 from photutils_mgauss.crowded.tile import TileOptions
 from photutils_mgauss.psf.local import LocalPSF
-from photutils_mgauss.utils.image import Image, find_gain
+from photutils_mgauss.utils.image import read_pixels, read_values, with_unit
+from photutils_mgauss.utils.star_columns import column_values, read_sources
 from photutils_mgauss.utils.validation import (
     as_floats,
     as_integer,
@@ -30,9 +30,6 @@ from photutils_mgauss.utils.validation import (
 __all__ = ['CrowdedMixturePhotometry', 'InjectionResult',
            'UnfinishedTilesError', 'inject_and_recover']
 
-_NAMES = {'x': ('x_init', 'x', 'x_fit', 'x_centroid', 'xcentroid'),
-          'y': ('y_init', 'y', 'y_fit', 'y_centroid', 'ycentroid'),
-          'flux': ('flux_init', 'flux', 'flux_fit')}
 # A PSF whose size is off by more than this fraction is warned of.
 _WIDTH_TOLERANCE = 0.1
 
@@ -233,19 +230,20 @@ class CrowdedMixturePhotometry:
 
         Parameters
         ----------
-        data : (ny, nx) array_like, `~astropy.units.Quantity` or \
-                `~astropy.nddata.NDData`
-            The image.
+        data : (ny, nx) array_like or NDData
+            The image. Its own mask counts, its unit comes back: see
+            :ref:`pixels`.
         mask : (ny, nx) array_like of bool, optional
-            True for pixels to leave out; pixels that are not finite, or
-            whose error is not positive, are left out, too.
-        error : (ny, nx) array_like, optional
-            The standard deviation of each pixel. By default it is estimated,
-            one number for the image.
+            True for pixels to leave out. Masks of ``data`` and ``error``
+            count, too; pixels that are not finite, or whose error is not
+            positive, are left out as well.
+        error : float or (ny, nx) array_like, optional
+            The standard deviation of each pixel in the unit of ``data``. By
+            default it is estimated, one number for the image.
         init_params : `~astropy.table.Table`, optional
-            Positions ``x_init``, ``y_init`` and, if known, ``flux_init`` of
-            the stars to report. None is added, none left out, and the result
-            has their order.
+            Positions ``x_init``, ``y_init`` (or ``x``, ``y``, ...) and, if
+            known, ``flux_init`` of the stars to report. None is added, none
+            left out, and the result has their order.
 
         Returns
         -------
@@ -259,8 +257,9 @@ class CrowdedMixturePhotometry:
         UnfinishedTilesError
             If a worker failed; the finished tiles are in the error.
         """
-        image = Image.of(data, error, mask)
-        given = None if init_params is None else _given(init_params)
+        image = read_pixels(data, error, mask).with_error()
+        given = (None if init_params is None
+                 else _given(init_params, image.unit))
         plan = Plan(image, self._psf, self._options(image), self.tile_shape,
                     self.overlap, given)
         outcomes, errors = run(plan, self.executor, self.progress_bar)
@@ -273,10 +272,10 @@ class CrowdedMixturePhotometry:
         return self.results
 
     def _options(self, image):
-        data, variance = image.sample()
+        _, variance = image.sample()
         gain = self.effective_gain
         if gain is None:
-            gain = find_gain(data, variance)
+            gain = image.gain()
         if variance.size == 0:
             variance = np.ones(1)
         return TileOptions(
@@ -346,15 +345,13 @@ class CrowdedMixturePhotometry:
             raise ValueError(msg)
         shape = as_shape(shape, 'shape')
         table = self.results
-        flux = np.asarray(getattr(table['flux_fit'], 'value',
-                                  table['flux_fit']), float)
+        flux = column_values(table, 'flux_fit')
         flux = np.where(table['flags'] & REPEATED, 0, flux)
         image = _draw(self._psf, table['x_fit'], table['y_fit'], flux, shape,
                       psf_shape)
         if include_local_bkg and len(table):
             image += _nearest_background(table, shape)
-        unit = getattr(table['flux_fit'], 'unit', None)
-        return image if unit is None else image * unit
+        return with_unit(image, getattr(table['flux_fit'], 'unit', None))
 
     def make_residual_image(self, data, *, psf_shape=None,
                             include_local_bkg=False):
@@ -363,7 +360,7 @@ class CrowdedMixturePhotometry:
 
         Parameters
         ----------
-        data : (ny, nx) array_like
+        data : (ny, nx) array_like or NDData
             The image.
         psf_shape, include_local_bkg
             See `make_model_image`.
@@ -372,10 +369,9 @@ class CrowdedMixturePhotometry:
         -------
         (ny, nx) `~numpy.ndarray` or `~astropy.units.Quantity`
         """
-        data = getattr(data, 'data', data) if isinstance(
-            data, NDData) else data
-        return data - self.make_model_image(
-            np.shape(data), psf_shape=psf_shape,
+        pixels = read_pixels(data)
+        return with_unit(pixels.data, pixels.unit) - self.make_model_image(
+            pixels.shape, psf_shape=psf_shape,
             include_local_bkg=include_local_bkg)
 
 
@@ -396,21 +392,10 @@ def _local_psf(model):
         bool(model.pixel_integrated))
 
 
-def _given(table):
+def _given(table, unit):
     """Return x, y, flux (NaN if unknown) and the row of each position."""
-    table = Table(table)
-    found = {}
-    for key, names in _NAMES.items():
-        name = next((n for n in names if n in table.colnames), None)
-        if name is None and key != 'flux':
-            msg = (f'init_params must have a column {names[0]}, got '
-                   f'{table.colnames}')
-            raise ValueError(msg)
-        column = np.full(len(table), np.nan) if name is None else table[name]
-        column = np.ma.filled(np.ma.asarray(
-            getattr(column, 'value', column), float), np.nan)
-        found[key] = np.asarray(column, float)
-    return found['x'], found['y'], found['flux'], np.arange(len(table))
+    found = read_sources(table, 'init_params', first='_init', unit=unit)
+    return found.x, found.y, found.flux, np.arange(len(table))
 
 
 def _in_given_order(stars, given):
@@ -452,8 +437,7 @@ def _draw(psf, x, y, flux, shape, psf_shape):
 
 def _nearest_background(table, shape):
     from scipy.spatial import cKDTree
-    level = table['local_bkg']
-    level = np.asarray(getattr(level, 'value', level), float)
+    level = column_values(table, 'local_bkg')
     good = np.isfinite(level) & np.isfinite(table['x_fit'])
     tree = cKDTree(np.column_stack([table['x_fit'][good],
                                     table['y_fit'][good]]))
@@ -477,8 +461,9 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     ----------
     photometry : CrowdedMixturePhotometry
         How the image is reduced.
-    data : (ny, nx) array_like
-        The image.
+    data : (ny, nx) array_like or NDData
+        The image. Its own mask counts, its unit comes back: see
+        :ref:`pixels`.
     flux : (n,) array_like or (low, high) tuple of float
         The fluxes of the stars of one repeat, or limits between which they
         are drawn evenly in the logarithm, as many as there is room for.
@@ -526,7 +511,9 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     1.0
     """
     rng = np.random.default_rng(rng)
-    image, variance = Image.of(data, error, mask).part()
+    pixels = read_pixels(data, error, mask).with_error()
+    image, variance = pixels.part()
+    flux = _true_fluxes(flux, pixels.unit)
     gain = as_real(effective_gain, 'effective_gain', above=0)
     repeats = as_integer(repeats, 'repeats', minimum=1)
     separation = as_real(separation, 'separation', minimum=5)
@@ -546,16 +533,30 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     stars = vstack(tables)
     if flux_edges is None:
         flux_edges = _flux_edges(np.asarray(stars['flux_true']))
-    return InjectionResult(stars, injection.curves(stars, flux_edges))
+    else:
+        flux_edges = read_values(flux_edges, 'flux_edges', pixels.unit)
+    curves = injection.curves(stars, flux_edges)
+    for table, names in ((stars, ('flux_true', 'flux_fit', 'flux_err')),
+                         (curves, ('flux_min', 'flux_max'))):
+        for name in names:
+            table[name] = with_unit(table[name], pixels.unit)
+    return InjectionResult(stars, curves)
+
+
+def _true_fluxes(flux, unit):
+    """Return the fluxes of artificial stars, or a tuple of limits."""
+    values = np.atleast_1d(as_floats(read_values(flux, 'flux', unit),
+                                     'flux'))
+    if not (values > 0).all():
+        msg = f'flux must be positive, got {values.min()}'
+        raise ValueError(msg)
+    return tuple(values) if isinstance(flux, tuple) else values
 
 
 def _artificial(variance, flux, separation, rng):
     """Draw x, y and flux of the artificial stars of one repeat."""
     limits = isinstance(flux, tuple)
-    flux = np.atleast_1d(as_floats(flux, 'flux'))
-    if not (flux > 0).all():
-        msg = f'flux must be positive, got {flux.min()}'
-        raise ValueError(msg)
+    flux = np.asarray(flux)
     n = variance.size if limits else flux.size
     x, y = injection.place_stars(variance.shape, variance == 0, n, separation,
                                  rng)
@@ -569,7 +570,7 @@ def _artificial(variance, flux, separation, rng):
 
 
 def _positions(table):
-    return tuple(np.asarray(getattr(table[name], 'value', table[name]), float)
+    return tuple(column_values(table, name)
                  for name in ('x_fit', 'y_fit', 'flux_fit'))
 
 
@@ -580,8 +581,7 @@ def _injected(true, table, row):
     out['recovered'] = found
     for name in ('x_fit', 'y_fit', 'flux_fit', 'x_err', 'y_err', 'flux_err'):
         column = np.full(row.size, np.nan)
-        values = getattr(table[name], 'value', table[name])
-        column[found] = np.asarray(values, float)[row[found]]
+        column[found] = column_values(table, name)[row[found]]
         out[name] = column
     out['flags'] = np.zeros(row.size, int)
     out['flags'][found] = np.asarray(table['flags'])[row[found]]

@@ -8,7 +8,7 @@ from photutils_mgauss.crowded.solve import solve_tile
 from photutils_mgauss.crowded.table import StarTable, tabulate
 from photutils_mgauss.crowded.tile import CELL, TileJob, TileOptions
 from photutils_mgauss.psf.local import LocalPSF
-from photutils_mgauss.utils.image import Image
+from photutils_mgauss.utils.image import PixelData
 from photutils_mgauss.utils.parallel import available_cores
 
 # The smallest and the largest size of tiles if none is given [pix].
@@ -45,7 +45,7 @@ class Plan:
     ``given`` is None, or x, y, flux and number of the stars of a list.
     """
 
-    image: Image
+    image: PixelData
     psf: LocalPSF
     options: TileOptions
     tile_shape: tuple | None

@@ -4,6 +4,7 @@ from astropy.table import QTable
 
 from photutils_mgauss.field.forms import mixture_arrays
 from photutils_mgauss.field.normal import model_stamps, to_vector
+from photutils_mgauss.utils.image import with_unit
 from photutils_mgauss.utils.validation import as_real
 
 
@@ -118,8 +119,9 @@ def star_table(fit, sample):
     if len(sample.reasons) > 1:
         table['exposure'] = sample.exposure
     table['x'], table['y'] = sample.expected()
-    table['x_fit'], table['y_fit'], table['flux_fit'] = _own_numbers(fit).T
-    table['local_bkg'] = problem.sky
+    table['x_fit'], table['y_fit'], flux = _own_numbers(fit).T
+    table['flux_fit'] = with_unit(flux, sample.unit)
+    table['local_bkg'] = with_unit(problem.sky, sample.unit)
     table['reduced_chi2'] = fit.equations.chi2 / np.maximum(n_pixels - 3, 1)
     table['n_pixels_fit'] = n_pixels
     table['n_pixels_rejected'] = fit.deviant_pixels.sum(axis=(1, 2))

@@ -47,19 +47,21 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
 
     Parameters
     ----------
-    data : (ny, nx) array_like or list of those
-        The image, its background subtracted.
+    data : (ny, nx) array_like or NDData, or list of those
+        The image, its background subtracted. Its own mask counts, its unit
+        comes back: see :ref:`pixels`.
     stars : `~astropy.table.Table` or list of those
         The stars: ``x``, ``y`` and, if known, ``flux``; photutils' names with
         ``_fit``, ``_init`` or ``_centroid`` are understood. If it has a
         column ``selected``, as tables of `select_psf_stars` do, the PSF is
         fitted to those stars and the others count as neighbours.
-    error : (ny, nx) array_like or list of those, optional
-        The standard deviation of each pixel. By default it is estimated from
-        the scatter of the pixels.
+    error : float or (ny, nx) array_like, or list of those, optional
+        The standard deviation of each pixel in the unit of ``data``. By
+        default it is estimated from the scatter of the pixels.
     mask : (ny, nx) array_like of bool or list of those, optional
-        True for pixels to leave out. Pixels that are not finite, or whose
-        error is not positive, are left out, too.
+        True for pixels to leave out. Masks of ``data`` and ``error`` count,
+        too; pixels that are not finite, or whose error is not positive, are
+        left out as well.
     n_components : int or 'auto', optional
         The number K of Gaussians; 'auto' tries 2 to 7 and keeps the number
         that describes stars left out of the fit best.

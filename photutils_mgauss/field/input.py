@@ -1,6 +1,7 @@
 """Stars of one or more exposures, as the fit of a field wants them."""
 import warnings
 from dataclasses import dataclass, replace
+from numbers import Real
 
 import numpy as np
 from astropy.table import QTable, Table
@@ -11,8 +12,8 @@ from photutils_mgauss.field.choice import DEGREES
 from photutils_mgauss.field.forms import FreeShapes
 from photutils_mgauss.field.normal import FieldProblem
 from photutils_mgauss.field.stamps import Stamps, cut_stamps, remove_star_noise
+from photutils_mgauss.utils.image import read_pixels
 from photutils_mgauss.utils.star_columns import read_sources
-from photutils_mgauss.utils.validation import as_image
 
 # Neighbours may be this far off their catalogue positions [pix].
 _NEIGHBOUR_STDDEV = 0.5
@@ -41,6 +42,8 @@ class Sample:
         Of the detector.
     catalogues : list of Sources
         As given.
+    unit : `~astropy.units.UnitBase` or None
+        Of the pixels.
     """
 
     stamps: Stamps
@@ -51,6 +54,7 @@ class Sample:
     reasons: list
     shape: tuple
     catalogues: list
+    unit: object
 
     def expected(self):
         """Return x and y (n,) of the stars in their tables."""
@@ -100,7 +104,8 @@ def normalised(x, y, shape):
 def read_sample(data, stars, error, mask, radius, gain):
     """Check the exposures, cut their stars out, and say who is left out."""
     exposures = list(_exposures(data, stars, error, mask))
-    parts = [_read_one(*one, radius, gain) for one in exposures]
+    parts = [_read_one(pixels, table, radius, gain)
+             for pixels, table in exposures]
     stamps = Stamps.joined([part[0] for part in parts])
     if not len(stamps.data):
         msg = (f'stars must hold at least 1 star whose pixels can be used, '
@@ -116,70 +121,71 @@ def read_sample(data, stars, error, mask, radius, gain):
         np.repeat(np.arange(len(parts)), [len(part[1]) for part in parts]),
         np.concatenate([part[1] for part in parts]),
         [part[3] for part in parts], exposures[0][0].shape,
-        [part[2] for part in parts])
+        [part[2] for part in parts], exposures[0][0].unit)
 
 
 def _exposures(data, stars, error, mask):
-    """Yield the checked images and the table of each exposure."""
+    """Yield the pixels and the table of each exposure."""
     if isinstance(stars, Table) or not isinstance(stars, (list, tuple)):
-        yield (*_images(data, error, mask), stars)
+        yield read_pixels(data, error, mask), stars
         return
     lists = {'data': data, 'error': error, 'mask': mask}
     for name, one in lists.items():
-        if one is None:
-            lists[name] = [None] * len(stars)
-        elif len(one) != len(stars):
+        n_images = len(one) if isinstance(one, (list, tuple)) or getattr(
+            one, 'ndim', 0) else 1
+        if one is None or (name == 'error' and isinstance(one, Real)):
+            lists[name] = [one] * len(stars)
+        elif n_images != len(stars):
             msg = (f'{name} must hold an image for each of the {len(stars)} '
-                   f'tables in stars, got {len(one)}')
+                   f'tables in stars, got {n_images}')
             raise ValueError(msg)
     if not stars:
         msg = 'stars must hold at least 1 table, got none'
         raise ValueError(msg)
-    shape = np.shape(data[0])
+    first = None
     for *given, table in zip(*lists.values(), stars, strict=True):
-        images = _images(*given)
-        if images[0].shape != shape:
-            msg = (f'data must be exposures of one detector, got the shapes '
-                   f'{shape} and {images[0].shape}')
-            raise ValueError(msg)
-        yield (*images, table)
+        pixels = read_pixels(*given)
+        first = pixels if first is None else first
+        _check_same(first, pixels)
+        yield pixels, table
 
 
-def _images(data, error, mask):
-    data = as_image(data, 'data')
-    if error is not None:
-        error = as_image(error, 'error', data.shape)
-    if mask is not None:
-        mask = as_image(mask, 'mask', data.shape).astype(bool)
-    return data, error, mask
+def _check_same(first, pixels):
+    """Raise unless two exposures are of one detector and in one unit."""
+    if pixels.shape != first.shape:
+        msg = (f'data must be exposures of one detector, got the shapes '
+               f'{first.shape} and {pixels.shape}')
+        raise ValueError(msg)
+    if pixels.unit != first.unit:
+        msg = (f'data must be exposures in one unit, got {first.unit} and '
+               f'{pixels.unit}')
+        raise ValueError(msg)
 
 
-def _read_one(data, error, mask, table, radius, gain):
+def _read_one(pixels, table, radius, gain):
     """Return stamps, their rows, sources, reasons, neighbours, counts."""
-    sources = read_sources(table)
-    stamps, rows, reasons = _usable_stamps(data, error, mask, sources, radius,
-                                           gain)
+    sources = read_sources(table, unit=pixels.unit)
+    stamps, rows, reasons = _usable_stamps(pixels, sources, radius, gain)
     around, count = _with_neighbours(sources, rows, stamps)
     return stamps, rows, sources, reasons, around, count
 
 
-def _usable_stamps(data, error, mask, sources, radius, gain):
+def _usable_stamps(pixels, sources, radius, gain):
     """Return stamps of usable stars, their rows, and why others are not."""
     reasons = np.full(sources.x.size, '', dtype='U12')
-    ny, nx = data.shape
+    ny, nx = pixels.shape
     with np.errstate(invalid='ignore'):
         inside = ((np.abs(sources.x - (nx - 1) / 2) <= nx / 2)
                   & (np.abs(sources.y - (ny - 1) / 2) <= ny / 2))
     reasons[~inside] = 'outside'
     rows = np.flatnonzero(inside & sources.selected)
-    stamps = cut_stamps(data, error, mask, sources.x[rows], sources.y[rows],
-                        radius)
-    if error is None:
-        _estimate_noise(stamps, data)
+    stamps = cut_stamps(pixels, sources.x[rows], sources.y[rows], radius)
+    if pixels.error is None:
+        _estimate_noise(stamps, pixels.data)
     usable = stamps.usable()
     reasons[rows[~usable]] = 'masked'
     stamps = stamps.subset(usable)
-    if error is not None and usable.any():
+    if pixels.error is not None and usable.any():
         remove_star_noise(stamps, gain)
     return stamps, rows[usable], reasons
 

@@ -9,8 +9,9 @@ from photutils.utils.exceptions import NoDetectionsWarning
 from scipy.spatial import KDTree
 
 from photutils_mgauss.field.stamps import cut_stamps
+from photutils_mgauss.utils.image import read_level, read_pixels, with_unit
 from photutils_mgauss.utils.star_columns import read_sources
-from photutils_mgauss.utils.validation import as_image, as_integer, as_real
+from photutils_mgauss.utils.validation import as_integer, as_real
 
 __all__ = ['select_psf_stars']
 
@@ -33,16 +34,18 @@ def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
 
     Parameters
     ----------
-    data : (ny, nx) array_like
-        The image, its background subtracted.
+    data : (ny, nx) array_like or NDData
+        The image, its background subtracted. Its own mask counts, its unit
+        comes back: see :ref:`pixels`.
     sources : `~astropy.table.Table`, optional
         A catalogue with ``x``, ``y`` (or ``x_fit``, ``x_centroid``, ...) and
         perhaps ``flux``. By default sources are detected.
-    error : (ny, nx) array_like, optional
-        The standard deviation of each pixel; by default the scatter of the
-        image.
+    error : float or (ny, nx) array_like, optional
+        The standard deviation of each pixel in the unit of ``data``; by
+        default the scatter of the image.
     mask : (ny, nx) array_like of bool, optional
-        True for pixels that cannot be used.
+        True for pixels that cannot be used. Masks of ``data`` and ``error``
+        count, too.
     fwhm : float, optional
         The width of stars [pix] for their detection, 3 by default.
     threshold : float, optional
@@ -93,10 +96,7 @@ def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
     45 41 ok
     3 50 edge
     """
-    data = as_image(data, 'data')
-    error = None if error is None else as_image(error, 'error', data.shape)
-    mask = None if mask is None else as_image(mask, 'mask',
-                                              data.shape).astype(bool)
+    pixels = read_pixels(data, error, mask)
     radius = as_real(radius, 'radius', minimum=2)
     isolation = (radius if isolation is None
                  else as_real(isolation, 'isolation', minimum=0))
@@ -104,25 +104,32 @@ def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
     if max_stars is not None:
         max_stars = as_integer(max_stars, 'max_stars', minimum=1)
     if sources is None:
-        sources = _detect(data, mask, fwhm, threshold, finder)
-    table = _measure(data, error, mask, read_sources(sources), radius)
+        sources = _detect(pixels, fwhm, threshold, finder)
+    table = _measure(pixels, read_sources(sources, 'sources'), radius)
+    saturation = (np.inf if saturation is None else
+                  read_level(saturation, 'saturation', pixels.unit))
     _judge(table, isolation, saturation, min_snr)
     if max_stars is not None:
-        _thin_out(table, max_stars, data.shape)
+        _thin_out(table, max_stars, pixels.shape)
     table['selected'] = table['reason'] == ''
     table.remove_columns([name for name in table.colnames
                           if name.startswith('_')])
+    for name in ('flux', 'peak'):
+        table[name] = with_unit(table[name], pixels.unit)
     return table
 
 
-def _detect(data, mask, fwhm, threshold, finder):
-    bad = ~np.isfinite(data)
-    mask = bad if mask is None else mask | bad
-    data = np.where(bad, 0, data)
-    if finder is None:
+def _detect(pixels, fwhm, threshold, finder):
+    bad = ~np.isfinite(pixels.data)
+    mask = bad if pixels.mask is None else pixels.mask | bad
+    data = np.where(bad, 0, pixels.data)
+    if finder is not None:
+        data = with_unit(data, pixels.unit)
+    else:
         fwhm = 3.0 if fwhm is None else as_real(fwhm, 'fwhm', above=0)
         if threshold is None:
             threshold = 5 * mad_std(data[~mask])
+        threshold = read_level(threshold, 'threshold', pixels.unit)
         threshold = as_real(threshold, 'threshold', above=0)
         # Below 1 photutils 3.1 makes a source of every pixel of a star.
         separation = max(0.5 * fwhm, _MIN_SEPARATION)
@@ -140,10 +147,10 @@ def _detect(data, mask, fwhm, threshold, finder):
     return Table({'x': found['x_centroid'], 'y': found['y_centroid']})
 
 
-def _measure(data, error, mask, sources, radius):
-    stamps = cut_stamps(data, error, mask, sources.x, sources.y, radius)
-    if error is None:
-        stamps.base[:] = mad_std(data, ignore_nan=True) ** 2
+def _measure(pixels, sources, radius):
+    stamps = cut_stamps(pixels, sources.x, sources.y, radius)
+    if pixels.error is None:
+        stamps.base[:] = mad_std(pixels.data, ignore_nan=True) ** 2
     inner = stamps.good & (stamps.offsets() <= 3)
     light = np.where(inner, stamps.data, 0)
     flux = light.sum(axis=(1, 2))
@@ -158,7 +165,7 @@ def _measure(data, error, mask, sources, radius):
     table['_core'] = core / np.where(flux > 0, flux, np.inf)
     table['_good'] = stamps.good.sum(axis=(1, 2)) / n_circle
     half = stamps.radius
-    ny, nx = data.shape
+    ny, nx = pixels.shape
     with np.errstate(invalid='ignore'):
         table['_margin'] = np.min([sources.x - half, nx - 1 - half
                                    - sources.x, sources.y - half, ny - 1
@@ -169,12 +176,10 @@ def _measure(data, error, mask, sources, radius):
 def _judge(table, isolation, saturation, min_snr):
     """Fill the column of reasons; the first that applies is given."""
     margin = np.nan_to_num(table['_margin'], nan=-np.inf)
-    peak_limit = np.inf if saturation is None else as_real(saturation,
-                                                           'saturation')
     checks = [
         ('outside', table['_good'] == 0),
         ('edge', margin < -0.5),
-        ('saturated', table['peak'] >= peak_limit),
+        ('saturated', table['peak'] >= saturation),
         ('masked', table['_good'] < 1),
         ('faint', table['snr'] < min_snr),
         ('neighbor', _has_neighbour(table, isolation))]

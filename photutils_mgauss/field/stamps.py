@@ -3,6 +3,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from photutils_mgauss.utils.image import photon_slope
+
 # A stamp is used if its middle 3x3 pixels and this share of the rest are.
 _MIN_GOOD = 0.5
 
@@ -62,12 +64,13 @@ class Stamps:
         return core & (self.good.sum(axis=(1, 2)) >= _MIN_GOOD * full)
 
 
-def cut_stamps(data, error, mask, x, y, radius):
+def cut_stamps(pixels, x, y, radius):
     """
-    Cut stamps of n stars out of an image.
+    Cut stamps of n stars out of an image, a `PixelData`.
 
-    Without ``error`` the variance is 1.
+    Without its ``error`` the variance is 1.
     """
+    data, error, mask = pixels.data, pixels.error, pixels.mask
     half = int(np.ceil(radius))
     # A star without a position is far from the image, too.
     positions = np.nan_to_num(np.column_stack([x, y]), nan=-1e6)
@@ -124,8 +127,8 @@ def remove_star_noise(stamps, gain):
         None to find out whether it was made from the data, and with what
         gain.
     """
-    slope, clipped = _poisson_slope(stamps) if gain is None else (1 / gain,
-                                                                  True)
+    slope, clipped = (1 / gain, True) if gain is not None else photon_slope(
+        stamps.data, np.where(stamps.good, stamps.base, 0))
     if slope == 0:
         return
     light = np.maximum(stamps.data, 0) if clipped else stamps.data
@@ -136,28 +139,3 @@ def remove_star_noise(stamps, gain):
                 1e-3 * np.median(stamps.base[stamps.good]))
     stamps.base = np.where(stamps.good, np.maximum(rest, floor), 1.0)
     stamps.slope[:] = slope
-
-
-def _poisson_slope(stamps):
-    """
-    Return how the variance grows with the data, and if it is clipped at 0.
-
-    The slope is 0 unless the variance was computed from these very pixels:
-    an expected variance scatters about any line in the data by their noise.
-    Differences of neighbouring pixels keep gradients of the sky out of this.
-    """
-    pairs = stamps.good[:, :, 1:] & stamps.good[:, :, :-1]
-    change = np.diff(stamps.base, axis=2)[pairs]
-    noise = np.sqrt(np.median(stamps.base[stamps.good]))
-    best, scatter = (0.0, True), 0.3
-    for clipped in (True, False):
-        light = np.maximum(stamps.data, 0) if clipped else stamps.data
-        step = np.diff(light, axis=2)[pairs]
-        power = step @ step
-        slope = step @ change / power if power > 0 else 0.0
-        if slope <= 0:
-            continue
-        rest = np.median(np.abs(change - slope * step)) / (slope * noise)
-        if rest < scatter:
-            best, scatter = (slope, clipped), rest
-    return best

@@ -6,7 +6,7 @@ density per native pixel at :math:`((i - x_o) / s_x, (j - y_o) / s_y)` from
 the star, with :math:`(x_o, y_o)` the origin and s the oversampling. So the
 pixels of a PSF of unit flux sum to :math:`s_x s_y`, as in photutils.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import partial
 
@@ -27,6 +27,7 @@ from photutils_mgauss.fitting.search import (
     stamp_shapes,
 )
 from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.utils.image import check_errors, read_stack, with_unit
 from photutils_mgauss.utils.parallel import map_chunks
 from photutils_mgauss.utils.validation import (
     as_choice,
@@ -34,7 +35,6 @@ from photutils_mgauss.utils.validation import (
     as_integer,
     as_real,
     as_shape,
-    as_stack,
 )
 
 __all__ = ['FitStatus', 'MixtureFit', 'fit_mixture']
@@ -112,7 +112,7 @@ class MixtureFit:
         How the fit ended; 0 is good.
     message : str
         The status in words.
-    flux : float
+    flux : float or `~astropy.units.Quantity`
         The total flux of the mixture in the image, its pixels being flux
         densities per native pixel.
     chi2 : float
@@ -123,7 +123,7 @@ class MixtureFit:
         ``n ln(chi2 / n) + p ln n`` without, for p parameters and n pixels.
     enclosed_flux : float
         The fraction of the mixture's flux inside the pixels used.
-    residual : (ny, nx) `~numpy.ndarray`
+    residual : (ny, nx) `~numpy.ndarray` or `~astropy.units.Quantity`
         Image minus model, also outside the pixels used.
     covariance : (6K, 6K) `~numpy.ndarray`
         Of flux, x_mean, y_mean, x_stddev, y_stddev and rho of each Gaussian
@@ -163,6 +163,14 @@ class MixtureFit:
                 f'{self.chi2:.6g}: {self.message}>')
 
 
+def fit_with_unit(fit, unit):
+    """Return a fit with flux and residual in the unit of its image or None."""
+    if unit is None:
+        return fit
+    return replace(fit, flux=with_unit(fit.flux, unit),
+                   residual=with_unit(fit.residual, unit))
+
+
 def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
                 error=None, mask=None, radius=None, enclosed_flux=None,
                 normalize='free', signed=False, means='free',
@@ -182,9 +190,10 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
 
     Parameters
     ----------
-    image : (ny, nx) or (n, ny, nx) array_like
+    image : (ny, nx) or (n, ny, nx) array_like or NDData
         The PSF sampled at pixel centres; it contains the pixel or not as the
-        mixture will. Negative wings are normal and not clipped.
+        mixture will. Negative wings are normal and not clipped. Its own mask
+        counts, its unit comes back: see :ref:`pixels`.
     n_components : int, optional
         The number K of Gaussians.
     oversampling : int or (y, x) tuple of int, optional
@@ -193,10 +202,12 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
         The image pixel that is the origin of the means. None is the middle,
         (n - 1) / 2.
     error : float or array_like, optional
-        The standard deviation of the pixels, broadcast to the image. None
-        gives all pixels the same weight.
+        The standard deviation of the pixels in the unit of ``image``,
+        broadcast to it; positive where pixels are not masked. None gives all
+        pixels the same weight.
     mask : array_like of bool, optional
-        True for pixels to leave out, broadcast to the image.
+        True for pixels to leave out, broadcast to the image. Masks of
+        ``image`` and ``error`` count, too.
     radius : float, optional
         Use only pixels with centres within this distance [native pix] of the
         image's peak, which is found to a fraction of a pixel.
@@ -260,7 +271,8 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
     >>> fit.mixture.weights
     array([0.8, 0.2])
     """
-    images, single = as_stack(image, 'image')
+    pixels, single = read_stack(image, error, mask)
+    images = pixels.data
     problem = StampProblem(
         n_components=as_integer(n_components, 'n_components', minimum=1),
         oversampling=as_shape(oversampling, 'oversampling'),
@@ -272,12 +284,13 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
         signed=bool(signed),
         fixed=as_choice(means, 'means', ('free', 'fixed')) == 'fixed',
         astrometric=_as_astrometric(weighting, oversampling),
-        has_error=error is not None)
-    weights = _as_weights(error, mask, images.shape)
+        has_error=pixels.error is not None)
+    weights = _as_weights(pixels)
     starts = _as_starts(start, len(images), problem)
     fits = map_chunks(partial(_fit_stack, problem),
                       (images, weights, starts), executor,
                       most=_LARGEST_CHUNK)
+    fits = [fit_with_unit(fit, pixels.unit) for fit in fits]
     if not single:
         return fits
     if not fits[0].status.usable:
@@ -307,35 +320,16 @@ def _as_origin(origin, shape):
     return as_floats(origin, 'origin', shape=(2,))
 
 
-def _as_weights(error, mask, shape):
+def _as_weights(pixels):
     """Return the weights (n, ny, nx), 0 for pixels that are masked."""
-    if error is None and mask is None:
-        return np.broadcast_to(1.0, shape)  # one number in memory
-    used = np.broadcast_to(True, shape)
-    if mask is not None:
-        mask = np.asarray(mask)
-        if mask.dtype != bool:
-            msg = f'mask must be an array of bool, got dtype {mask.dtype}'
-            raise TypeError(msg)
-        used = ~_broadcast(mask, 'mask', shape)
-    if error is None:
+    if pixels.error is None and pixels.mask is None:
+        return np.broadcast_to(1.0, pixels.shape)  # one number in memory
+    used = (np.broadcast_to(True, pixels.shape) if pixels.mask is None
+            else ~pixels.mask)
+    if pixels.error is None:
         return used.astype(float)
-    error = _broadcast(as_floats(error, 'error', finite=False), 'error', shape)
-    bad = used & ~((error > 0) & np.isfinite(error))
-    if bad.any():
-        msg = (f'error must be positive and finite, got {error[bad][0]}; mask '
-               'pixels that must not be used')
-        raise ValueError(msg)
-    return np.where(used, 1 / np.where(used, error, 1.0) ** 2, 0.0)
-
-
-def _broadcast(array, name, shape):
-    try:
-        return np.broadcast_to(array, shape)
-    except ValueError:
-        msg = (f'{name} must broadcast to the shape {shape[1:]} of an image, '
-               f'got {array.shape}')
-        raise ValueError(msg) from None
+    check_errors(pixels.error, used)
+    return np.where(used, 1 / np.where(used, pixels.error, 1.0) ** 2, 0.0)
 
 
 def _as_starts(start, n, problem):

@@ -4,15 +4,11 @@ import time
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss.fitting.image import fit_mixture
+from photutils_mgauss.fitting.image import fit_mixture, fit_with_unit
 from photutils_mgauss.fitting.phases import phase_error, phase_rows
 from photutils_mgauss.psf.shapes import adaptive_moments
-from photutils_mgauss.utils.validation import (
-    as_image,
-    as_integer,
-    as_real,
-    as_shape,
-)
+from photutils_mgauss.utils.image import read_pixels
+from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 __all__ = ['compare_n_components', 'select_n_components']
 
@@ -26,7 +22,7 @@ def compare_n_components(image, n_components=(1, 2, 3, 4, 5), **kwargs):
 
     Parameters
     ----------
-    image : (ny, nx) array_like
+    image : (ny, nx) array_like or NDData
         See `fit_mixture`.
     n_components : sequence of int, optional
         The numbers K to try.
@@ -58,7 +54,11 @@ def compare_n_components(image, n_components=(1, 2, 3, 4, 5), **kwargs):
     >>> table['max_residual'].round(3)
     array([0.022, 0.   ])
     """
-    image = as_image(image, 'image')
+    pixels = read_pixels(image, kwargs.pop('error', None),
+                         kwargs.pop('mask', None), name='image',
+                         broadcast=True)
+    image = pixels.data
+    kwargs |= {'error': pixels.error, 'mask': pixels.mask}
     numbers = _as_numbers(n_components)
     fit_mixture(image, 1, **kwargs)  # compiled before the clock starts
     fits, rows = [], []
@@ -70,7 +70,8 @@ def compare_n_components(image, n_components=(1, 2, 3, 4, 5), **kwargs):
                      fits[-1].message))
     return QTable(rows=rows, names=('n_components', 'time', 'chi2', 'bic',
                                     *_CRITERIA, 'message'),
-                  meta={'fits': fits})
+                  meta={'fits': [fit_with_unit(fit, pixels.unit)
+                                 for fit in fits]})
 
 
 def _as_numbers(n_components):
@@ -116,7 +117,7 @@ def select_n_components(image, n_components=(1, 2, 3, 4, 5), *,
 
     Parameters
     ----------
-    image : (ny, nx) array_like
+    image : (ny, nx) array_like or NDData
         See `fit_mixture`.
     n_components : sequence of int, optional
         The numbers K to try.

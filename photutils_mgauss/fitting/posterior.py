@@ -16,15 +16,15 @@ from astropy.table import QTable
 from scipy.optimize import linear_sum_assignment
 
 from photutils_mgauss.fitting.convergence import effective_size, split_r_hat
-from photutils_mgauss.fitting.image import MixtureFit, fit_mixture
+from photutils_mgauss.fitting.image import (
+    MixtureFit,
+    fit_mixture,
+    fit_with_unit,
+)
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.shapes import adaptive_moments
-from photutils_mgauss.utils.validation import (
-    as_choice,
-    as_image,
-    as_integer,
-    as_real,
-)
+from photutils_mgauss.utils.image import read_pixels, with_unit
+from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 
 __all__ = ['MixturePosterior', 'sample_mixture']
 
@@ -162,7 +162,8 @@ class MixturePosterior:
                 f'beta_x_{k + 1}': self.beta[..., k, 0],
                 f'beta_y_{k + 1}': self.beta[..., k, 1],
                 f'gamma_{k + 1}': self.gamma[..., k]}
-        return columns | {'flux': self.flux, 'sigma': self.sigma}
+        return columns | {'flux': np.asarray(self.flux),
+                          'sigma': np.asarray(self.sigma)}
 
     def summary(self):
         """
@@ -209,7 +210,7 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
 
     Parameters
     ----------
-    image : (ny, nx) array_like
+    image : (ny, nx) array_like or NDData
         See `fit_mixture`.
     n_components : int, optional
         The number K of Gaussians.
@@ -275,7 +276,11 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
     array([[1.2, 1. ]])
     """
     _check_keywords(kwargs)
-    image = as_image(image, 'image')
+    pixels = read_pixels(image, kwargs.pop('error', None),
+                         kwargs.pop('mask', None), name='image',
+                         broadcast=True)
+    image = pixels.data
+    kwargs |= {'error': pixels.error, 'mask': pixels.mask}
     prior = as_choice(prior, 'prior', ('scaled', 'paper'))
     as_choice(sampler, 'sampler', ('pymc', 'nutpie', 'numpyro'))
     if prior == 'paper':
@@ -298,7 +303,7 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
                     draws=draws,
                     tune=as_integer(tune, 'tune', minimum=0),
                     chains=as_integer(chains, 'chains', minimum=1))
-    return _posterior(idata, data, fit)
+    return _posterior(idata, data, fit, pixels.unit)
 
 
 def _check_keywords(keywords):
@@ -503,7 +508,7 @@ def _sample(model, sampler, **options):
 
 # Labels.
 
-def _posterior(idata, data, fit):
+def _posterior(idata, data, fit, unit):
     """Return the draws in native pixels and image units, relabelled."""
     draws = {name: np.asarray(idata['posterior'][name].values)
              for name in ('omega', 'alpha', 'beta', 'gamma', 'flux', 'sigma')}
@@ -512,9 +517,10 @@ def _posterior(idata, data, fit):
         draws['gamma'], fit.mixture)
     sigma = draws['sigma']
     if data.error is None:
-        sigma = sigma * fit.flux * data.unit**2
-    return MixturePosterior(omega, alpha, beta, gamma,
-                            draws['flux'] * fit.flux, sigma, fit, idata)
+        sigma = with_unit(sigma * fit.flux * data.unit**2, unit)
+    flux = with_unit(draws['flux'] * fit.flux, unit)
+    return MixturePosterior(omega, alpha, beta, gamma, flux, sigma,
+                            fit_with_unit(fit, unit), idata)
 
 
 def relabel(omega, alpha, beta, gamma, reference):

@@ -24,6 +24,7 @@ from photutils_mgauss.sky.wcs import (
     pixel_jacobian,
     pixel_to_vectors,
 )
+from photutils_mgauss.utils import star_columns
 
 # What is read, in order of preference, and the unit of a plain number.
 COLUMNS = {
@@ -38,10 +39,7 @@ COLUMNS = {
 
 def find_column(table, key):
     """Return the name of the column that holds ``key``, or None."""
-    for name in COLUMNS[key]:
-        if name in table.colnames:
-            return name
-    return None
+    return star_columns.find_column(table, COLUMNS[key])
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,23 +244,7 @@ def numbers(table, key, unit=None):
 
     A column without unit is taken to be in ``unit``.
     """
-    name = find_column(table, key)
-    column = table[name]
-    has = getattr(column, 'unit', None)
-    if unit is not None and has is not None and has != '':
-        try:
-            column = u.Quantity(np.ma.filled(column, np.nan), has).to(unit)
-        except u.UnitConversionError as error:
-            msg = (f'column {name!r} must have a unit like {unit}, '
-                   f'got {has}')
-            raise ValueError(msg) from error
-        return np.array(column.value, dtype=float)
-    try:
-        return np.ma.filled(np.ma.asarray(getattr(column, 'value', column),
-                                          dtype=float), np.nan)
-    except (TypeError, ValueError) as error:
-        msg = f'column {name!r} must hold numbers'
-        raise TypeError(msg) from error
+    return star_columns.column_values(table, find_column(table, key), unit)
 
 
 def plane_unit(epoch):
@@ -450,7 +432,5 @@ def _ids(table):
 def _flux(table):
     if find_column(table, 'flux') is None:
         return np.full(len(table), np.nan)
-    name = find_column(table, 'flux')
-    return np.ma.filled(np.ma.asarray(
-        getattr(table[name], 'value', table[name]), dtype=float), np.nan)
+    return numbers(table, 'flux')
 

@@ -16,7 +16,6 @@ shallow to show the star by itself helps, too.
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
-from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import QTable
 
 from photutils_mgauss import kernels
@@ -34,6 +33,8 @@ from photutils_mgauss.sky.wcs import (
     pixel_jacobian,
     pixel_to_vectors,
 )
+from photutils_mgauss.utils.image import read_pixels
+from photutils_mgauss.utils.star_columns import column_values
 from photutils_mgauss.utils.validation import as_shape
 
 __all__ = ['add_sky_positions', 'fit_many']
@@ -87,13 +88,13 @@ def add_sky_positions(table, wcs):
     if missing:
         msg = f'table must have the column {min(missing)}, got none'
         raise ValueError(msg)
-    x, y = (np.asarray(table[name], float) for name in ('x_fit', 'y_fit'))
+    x, y = (column_values(table, name, u.pix) for name in ('x_fit', 'y_fit'))
     vectors = pixel_to_vectors(wcs, x, y)
     covariance = np.zeros((len(table), 2, 2))
     for i, name in enumerate(('x_err', 'y_err')):
-        covariance[:, i, i] = np.asarray(table[name], float) ** 2
+        covariance[:, i, i] = column_values(table, name, u.pix) ** 2
     if 'xy_cov' in table.colnames:
-        cross = np.asarray(table['xy_cov'], float)
+        cross = column_values(table, 'xy_cov', u.pix**2)
         covariance[:, 0, 1] = covariance[:, 1, 0] = cross
     out = table.copy()
     plane = TangentPlane.around(vectors)
@@ -129,11 +130,11 @@ def fit_many(images, coordinates, *, fit_shape=11, common_flux=False):
     Parameters
     ----------
     images : sequence of (data, psf, wcs)
-        ``data`` is a (ny, nx) array, or an `~astropy.nddata.NDData` with its
-        ``uncertainty`` and ``mask``; ``psf`` a `GriddedMixturePSF`,
-        `MultiGaussianPSFModel` or `MixtureField`; ``wcs`` a gwcs or
-        `astropy.wcs.WCS` with celestial axes. The units of data, if any, are
-        to be the same.
+        ``data`` is a (ny, nx) array_like, or an NDData with its uncertainty;
+        its own mask counts, its unit comes back: see :ref:`pixels`. ``psf``
+        is a `GriddedMixturePSF`, `MultiGaussianPSFModel` or `MixtureField`;
+        ``wcs`` a gwcs or `astropy.wcs.WCS` with celestial axes. The units of
+        data, if any, are to be the same.
     coordinates : (n,) `~astropy.coordinates.SkyCoord`
         Where the stars are, to a pixel or so.
     fit_shape : int or (ny, nx) tuple of int, optional
@@ -348,19 +349,9 @@ def _read_image(entry):
     if not is_fixed_shape(psf):
         msg = f'images must hold PSFs of fixed shape, got {psf!r:.80}'
         raise TypeError(msg)
-    error = mask = unit = None
-    if isinstance(data, NDData):
-        mask, unit, uncertainty = data.mask, data.unit, data.uncertainty
-        if uncertainty is not None:
-            error = uncertainty.represent_as(StdDevUncertainty).array
-        data = data.data
-    elif isinstance(data, u.Quantity):
-        data, unit = data.value, data.unit
-    if np.ndim(data) != 2:
-        msg = f'images must hold 2-D data, got {np.ndim(data)} dimensions'
-        raise ValueError(msg)
-    image = KernelImage.from_arrays(data, error, mask)
-    return image, psf_arrays(psf), wcs, unit
+    pixels = read_pixels(data, name='data of images')
+    image = KernelImage.from_arrays(pixels.data, pixels.error, pixels.mask)
+    return image, psf_arrays(psf), wcs, pixels.unit
 
 
 def _boxes(xy, fit_shape, data_shape):

@@ -25,6 +25,12 @@ from photutils_mgauss.photometry.engine import (
 )
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.model import MultiGaussianPSFModel
+from photutils_mgauss.utils.image import (
+    read_level,
+    read_quantity,
+    read_values,
+    with_unit,
+)
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = ['CramerRao', 'cramer_rao', 'pixel_error']
@@ -79,17 +85,18 @@ def pixel_error(light, *, sky=0, read_noise=0, gain=1, exposure_time=None):
 
     Parameters
     ----------
-    light : (ny, nx) array_like
+    light : (ny, nx) array_like or NDData
         The light above the sky: the image itself, as in the paper, or a model
         of it. Errors from the image are too small where noise made a pixel
         faint, and weighted fluxes come out low; with a model they do not.
-        Negative light counts as none.
+        Negative light counts as none. The error of a masked pixel is NaN, a
+        unit comes back: see :ref:`pixels`.
     sky, read_noise, gain, exposure_time : optional
         As for `background_error`; ``sky`` may be an image.
 
     Returns
     -------
-    (ny, nx) `~numpy.ndarray`
+    (ny, nx) `~numpy.ndarray` or `~astropy.units.Quantity`
         Standard deviations in the unit of the image, by
         `photutils.utils.calc_total_error`.
 
@@ -106,12 +113,13 @@ def pixel_error(light, *, sky=0, read_noise=0, gain=1, exposure_time=None):
     >>> pixel_error([[0.0, 3.0]], sky=0.96, read_noise=2, exposure_time=100)
     array([[0.1, 0.2]])
     """
-    light = as_floats(light, 'light', finite=False)
+    light, unit = read_quantity(light, 'light')
+    sky = read_values(sky, 'sky', unit)
     background = background_error(sky=sky, read_noise=read_noise, gain=gain,
                                   exposure_time=exposure_time)
     background = np.broadcast_to(background, light.shape)
-    return calc_total_error(light, background,
-                            _electrons(gain, exposure_time))
+    return with_unit(calc_total_error(light, background,
+                                      _electrons(gain, exposure_time)), unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +131,8 @@ class CramerRao:
     ----------
     covariance : (n, 3, 3) `~numpy.ndarray`
         Of flux, x and y of each star.
+    unit : `~astropy.units.UnitBase` or None
+        Of the flux.
 
     Examples
     --------
@@ -136,11 +146,12 @@ class CramerRao:
     """
 
     covariance: np.ndarray
+    unit: object = None
 
     @property
     def flux_err(self):
         """The errors of the fluxes, (n,)."""
-        return np.sqrt(self.covariance[:, 0, 0])
+        return with_unit(np.sqrt(self.covariance[:, 0, 0]), self.unit)
 
     @property
     def x_err(self):
@@ -173,7 +184,7 @@ def cramer_rao(psf, flux, sky=0, *, x=0, y=0, read_noise=0, gain=1,
     psf : GaussianMixture, GriddedMixturePSF or MultiGaussianPSFModel
         The PSF. A mixture is taken to contain the pixel.
     flux : (n,) array_like
-        The total fluxes, in the unit of the image.
+        The total fluxes, in the unit of the image. A unit comes back.
     sky : float, optional
         The level of the sky, in the unit of the image.
     x, y : (n,) array_like, optional
@@ -205,19 +216,20 @@ def cramer_rao(psf, flux, sky=0, *, x=0, y=0, read_noise=0, gain=1,
     >>> bound.x_err
     array([0.01 , 0.001])
     """
-    flux, x, y = (np.atleast_1d(a).astype(float) for a in
-                  np.broadcast_arrays(as_floats(flux, 'flux'),
-                                      as_floats(x, 'x'), as_floats(y, 'y')))
-    level = background_error(sky=as_real(sky, 'sky', minimum=0),
+    flux, unit = read_quantity(flux, 'flux')
+    flux, x, y = (np.atleast_1d(a).astype(float) for a in np.broadcast_arrays(
+        as_floats(flux, 'flux'), as_floats(x, 'x'), as_floats(y, 'y')))
+    sky = as_real(read_level(sky, 'sky', unit), 'sky', minimum=0)
+    level = background_error(sky=sky,
                              read_noise=read_noise, gain=gain,
                              exposure_time=exposure_time)
     noise = level**2, _electrons(gain, exposure_time)
     jets = _Jets(psf, x, y, as_shape(fit_shape, 'fit_shape'))
     if jointly:
-        return CramerRao(_joint_bound(jets, flux, noise, free_sky))
+        return CramerRao(_joint_bound(jets, flux, noise, free_sky), unit)
     return CramerRao(np.array([
         _bound(jets.own(i), flux[i], noise, free_sky)
-        for i in range(x.size)]))
+        for i in range(x.size)]), unit)
 
 
 class _Jets:

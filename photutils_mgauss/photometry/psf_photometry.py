@@ -23,6 +23,8 @@ from photutils_mgauss.photometry import engine
 from photutils_mgauss.photometry import table as _table
 from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
 from photutils_mgauss.utils import compat
+from photutils_mgauss.utils.image import read_pixels, with_unit
+from photutils_mgauss.utils.star_columns import plain_values
 from photutils_mgauss.utils.validation import as_choice, as_real
 
 __all__ = ['MixturePSFPhotometry']
@@ -133,14 +135,14 @@ class MixturePSFPhotometry(PSFPhotometry):
 
         Parameters
         ----------
-        data : (ny, nx) array_like, `~astropy.units.Quantity` or \
-                `~astropy.nddata.NDData`
-            The image, background subtracted.
+        data : (ny, nx) array_like or NDData
+            The image, its background subtracted. Its own mask counts, its
+            unit comes back: see :ref:`pixels`.
         mask : (ny, nx) array_like of bool, optional
-            True where pixels are to be left out. Pixels that are not finite
-            are left out, too.
-        error : (ny, nx) array_like, optional
-            The standard deviations of the pixels.
+            True for pixels to leave out. Masks of ``data`` and ``error``
+            count, too; pixels that are not finite are left out as well.
+        error : float or (ny, nx) array_like, optional
+            The standard deviation of each pixel in the unit of ``data``.
         init_params : `~astropy.table.Table`, optional
             Where the stars are, as photutils takes it; by default what
             ``finder`` finds.
@@ -150,12 +152,17 @@ class MixturePSFPhotometry(PSFPhotometry):
         `~astropy.table.QTable` or None
             The table of results; None if there are no stars.
         """
+        if isinstance(data, NDData):
+            compat.check_nddata(mask, error)
+        pixels = read_pixels(data, error, mask)
+        data, error = (array if array is None
+                       else with_unit(array, pixels.unit)
+                       for array in (pixels.data, pixels.error))
+        mask = pixels.mask
         if not self._can_fit:
             return super().__call__(data, mask=mask, error=error,
                                     init_params=init_params)
         compat.reset(self)
-        if isinstance(data, NDData):
-            data, mask, error = compat.split_nddata(data, mask, error)
         data, mask, error, init_params = compat.prepare_inputs(
             self, data, mask, error, init_params)
         if init_params is None:
@@ -283,9 +290,9 @@ class _Start:
 
     def __init__(self, photometry, image, init_params):
         self.initial = np.column_stack(
-            [_table.plain(init_params[f'{name}_init'])
+            [plain_values(init_params[f'{name}_init'])
              for name in ('flux', 'x', 'y')])
-        self.local_bkg = _table.plain(init_params['local_bkg'])
+        self.local_bkg = plain_values(init_params['local_bkg'])
         self.free = photometry._free
         self._set_bounds(photometry)
         self._set_boxes(photometry.fit_shape, image)

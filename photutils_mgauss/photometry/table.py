@@ -3,7 +3,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from astropy.units import Quantity
 
 from photutils_mgauss.photometry.engine import CONVERGED
 from photutils_mgauss.photometry.fitter import MESSAGES
@@ -123,14 +122,6 @@ class FitInfo(Sequence):
 
     def __repr__(self):
         return f'<FitInfo of {len(self)} stars>'
-
-
-def plain(column):
-    """Return a column as a plain array without unit, NaN where masked."""
-    values = np.array(column.value if isinstance(column, Quantity)
-                      else column, dtype=float)
-    values[getattr(column, 'mask', False)] = np.nan
-    return values
 
 
 def define_flags(result, fit_shape, data_shape):

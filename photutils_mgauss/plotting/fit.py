@@ -2,6 +2,7 @@
 import numpy as np
 
 from photutils_mgauss.plotting.style import BLACK, BLUE, CYCLE, VERMILION
+from photutils_mgauss.utils.image import read_quantity
 
 __all__ = [
     'plot_comparison_of_numbers',
@@ -22,7 +23,7 @@ def plot_projection(ax, fit, image, *, axis='x', oversampling=1):
         Where to draw.
     fit : MixtureFit
         The fit.
-    image : (ny, nx) array_like
+    image : (ny, nx) array_like or NDData
         The image that was fitted.
     axis : {'x', 'y'}, optional
         The axis that stays.
@@ -34,7 +35,7 @@ def plot_projection(ax, fit, image, *, axis='x', oversampling=1):
     `~matplotlib.axes.Axes`
         The same.
     """
-    image = np.asarray(image, float)
+    image, _ = read_quantity(image, 'image')
     step = np.broadcast_to(oversampling, 2)[::-1][0 if axis == 'x' else 1]
     along = 0 if axis == 'x' else 1
     data = image.sum(axis=along)
@@ -43,10 +44,10 @@ def plot_projection(ax, fit, image, *, axis='x', oversampling=1):
     across = np.broadcast_to(oversampling, 2)[::-1][1 if axis == 'x' else 0]
     i = 0 if axis == 'x' else 1
     total = np.zeros_like(fine)
-    mixture = fit.mixture
+    mixture, flux = fit.mixture, np.asarray(fit.flux)
     for k in range(mixture.n_components):
         stddev = mixture.stddevs[k, i]
-        curve = (fit.flux * across * mixture.weights[k]
+        curve = (flux * across * mixture.weights[k]
                  / (np.sqrt(2 * np.pi) * stddev)
                  * np.exp(-0.5 * ((fine - mixture.means[k, i]) / stddev)**2))
         total += curve
@@ -73,7 +74,7 @@ def plot_profile(ax, fit, image):
         Where to draw.
     fit : MixtureFit
         The fit.
-    image : (ny, nx) array_like
+    image : (ny, nx) array_like or NDData
         The image that was fitted.
 
     Returns
@@ -81,13 +82,14 @@ def plot_profile(ax, fit, image):
     `~matplotlib.axes.Axes`
         The same.
     """
-    image = np.asarray(image, float)
+    image, _ = read_quantity(image, 'image')
     row, _ = np.unravel_index(np.nanargmax(np.where(fit.used, image, -np.inf)),
                               image.shape)
-    peak = image[row].max()
+    peak = np.nanmax(image[row])
+    residual = np.asarray(fit.residual)
     lines = {'image': (image[row], BLACK, '.'),
-             'mixture': ((image - fit.residual)[row], VERMILION, '-'),
-             'residual, absolute': (np.abs(fit.residual[row]), BLUE, ':')}
+             'mixture': ((image - residual)[row], VERMILION, '-'),
+             'residual, absolute': (np.abs(residual[row]), BLUE, ':')}
     for name, (values, colour, style) in lines.items():
         shown = np.where(values > 0, values / peak, np.nan)
         ax.plot(shown, style, color=colour, label=name)
@@ -123,7 +125,8 @@ def plot_residual(ax, fit, *, peak, limit=None, label=None):
     `~matplotlib.image.AxesImage`
         To make a colour bar from.
     """
-    values = np.where(fit.used, fit.residual, np.nan) / peak
+    residual, peak = np.asarray(fit.residual), np.asarray(peak)
+    values = np.where(fit.used, residual, np.nan) / peak
     limit = np.nanmax(np.abs(values)) if limit is None else limit
     shown = ax.imshow(values, origin='lower', cmap='RdBu_r', vmin=-limit,
                       vmax=limit)
@@ -140,7 +143,7 @@ def plot_comparison_of_numbers(axes, image, table):
     ----------
     axes : sequence of `~matplotlib.axes.Axes`
         One more than the table has rows.
-    image : (ny, nx) array_like
+    image : (ny, nx) array_like or NDData
         The image.
     table : `~astropy.table.QTable`
         From `~photutils_mgauss.compare_n_components`.
@@ -150,7 +153,7 @@ def plot_comparison_of_numbers(axes, image, table):
     sequence of `~matplotlib.axes.Axes`
         The same.
     """
-    image = np.asarray(image, float)
+    image, _ = read_quantity(image, 'image')
     axes = np.ravel(axes)
     if len(axes) != len(table) + 1:
         msg = (f'axes must be one more than the {len(table)} rows of the '
@@ -160,7 +163,7 @@ def plot_comparison_of_numbers(axes, image, table):
     axes[0].set(xticks=[], yticks=[], title='image')
     limit = max(table['max_residual'])
     for ax, row, fit in zip(axes[1:], table, table.meta['fits'], strict=True):
-        plot_residual(ax, fit, peak=image.max(), limit=limit,
+        plot_residual(ax, fit, peak=np.nanmax(image), limit=limit,
                       label=f"K = {row['n_components']}, "
                             f"{1e3 * row['time']:.1f} ms")
     return axes

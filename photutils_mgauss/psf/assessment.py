@@ -214,4 +214,4 @@ def _moments(profile, oversampling, x, y):
     found = [profile(*place) for place in zip(x, y, strict=True)]
     if all(isinstance(one, GaussianMixture) for one in found):
         return adaptive_moments(found)
-    return adaptive_moments(np.array(found), oversampling=oversampling)
+    return adaptive_moments(found, oversampling=oversampling)

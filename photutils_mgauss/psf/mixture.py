@@ -15,7 +15,12 @@ from photutils_mgauss import kernels
 from photutils_mgauss.files.storage import storable
 from photutils_mgauss.psf.integrals import polar_integral
 from photutils_mgauss.psf.rows import kernel_rows, matrices
-from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
+from photutils_mgauss.utils.validation import (
+    as_floats,
+    as_real,
+    as_shape,
+    in_pixels,
+)
 
 __all__ = ['GaussianMixture', 'Moments', 'blend']
 
@@ -532,7 +537,8 @@ def blend(mixtures, fractions):
 
 def _points(x, y):
     """Return flat float64 positions and the shape they broadcast to."""
-    x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+    x, y = np.broadcast_arrays(np.asarray(in_pixels(x, 'x'), float),
+                               np.asarray(in_pixels(y, 'y'), float))
     return x.ravel(), y.ravel(), x.shape
 
 

@@ -7,15 +7,17 @@ centre is the weighted centroid, and the weighted covariance is M / 2. The
 sizes given here are those of M, as in GalSim, so :math:`R^2` is twice that of
 Eq. 7 as printed; the ratios of Eqs. 6 and 8 do not notice.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import partial
 
 import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.utils.image import check_errors, read_stack, with_unit
 from photutils_mgauss.utils.parallel import map_chunks
-from photutils_mgauss.utils.validation import as_floats, as_shape, as_stack
+from photutils_mgauss.utils.validation import as_floats, as_shape
 
 __all__ = ['ShapeStatus', 'Shapes', 'adaptive_moments']
 
@@ -80,7 +82,8 @@ class Shapes:
     x, y : float or (n,) `~numpy.ndarray`
         The centre of the matching Gaussian relative to the origin [pix].
     flux : float or (n,) `~numpy.ndarray`
-        The flux of the matching Gaussian.
+        The flux of the matching Gaussian, in the unit of the image if it has
+        one.
     r2_err, e1_err, e2_err, x_err, y_err : float or (n,) `~numpy.ndarray`
         Standard errors; NaN where no errors of pixels were given.
     status : int or (n,) `~numpy.ndarray`
@@ -192,19 +195,23 @@ def adaptive_moments(image, *, oversampling=1, origin=None, error=None,
 
     Parameters
     ----------
-    image : (ny, nx) or (n, ny, nx) array_like, GaussianMixture, or sequence
+    image : (ny, nx) or (n, ny, nx) array_like or NDData, GaussianMixture, or \
+            sequence
         One image or a stack; one mixture or several, which may differ in
-        their number of Gaussians.
+        their number of Gaussians. The own mask of an image counts, its unit
+        comes back: see :ref:`pixels`.
     oversampling : int or (y, x) tuple of int, optional
         Image pixels per native pixel.
     origin : (x, y) array_like, optional
         The image pixel that positions are relative to; None is the middle.
     error : float or array_like, optional
-        The standard deviation of the pixels, broadcast to the image. It gives
-        the errors of the result and does not change the result.
+        The standard deviation of the pixels in the unit of ``image``,
+        broadcast to it; positive where pixels are not masked. It gives the
+        errors of the result and does not change the result.
     mask : array_like of bool, optional
-        True for pixels to leave out. They are filled with the matching
-        Gaussian at each step.
+        True for pixels to leave out, broadcast to the image. They are filled
+        with the matching Gaussian at each step. Masks of ``image`` and
+        ``error`` count, too.
     executor : `~concurrent.futures.Executor`, optional
         Where to measure a stack. None is a pool of threads on all cores.
 
@@ -234,15 +241,18 @@ def adaptive_moments(image, *, oversampling=1, origin=None, error=None,
         single = isinstance(image, GaussianMixture)
         rows = _measure_mixtures(mixtures)
         return _shapes(rows, single, np.ones(2), np.zeros(2))
-    images, used, variance, single = _as_images(image, error, mask)
-    rows = map_chunks(_measure_images, (images, used, variance), executor)
+    pixels, single = read_stack(image, error, mask)
+    images = pixels.data
+    rows = map_chunks(partial(_measure_images, pixels.error is not None),
+                      (images, *_used_and_error(pixels)), executor)
     shape = as_shape(oversampling, 'oversampling')
     pitch = np.array(shape[::-1], float)
     if origin is None:
         origin = (np.array(images.shape[:0:-1]) - 1) / 2
     else:
         origin = as_floats(origin, 'origin', shape=(2,))
-    return _shapes(np.array(rows), single, pitch, origin)
+    shapes = _shapes(np.array(rows), single, pitch, origin)
+    return replace(shapes, flux=with_unit(shapes.flux, pixels.unit))
 
 
 def _as_mixtures(value):
@@ -260,22 +270,17 @@ def _as_mixtures(value):
     return None
 
 
-def _as_images(image, error, mask):
-    """Return images, used pixels and variances (n, ny, nx), and if single."""
-    images, single = as_stack(image, 'image')
-    used = np.ones(images.shape, bool)
-    if mask is not None:
-        used &= ~np.asarray(mask, bool)
-    error = np.nan if error is None else as_floats(error, 'error',
-                                                   finite=False)
-    if (np.asarray(error) <= 0).any():
-        msg = f'error must be positive, got {np.min(error)}'
-        raise ValueError(msg)
-    variance = np.broadcast_to(np.square(error), images.shape)
-    return images, used, variance, single
+def _used_and_error(pixels):
+    """Return which pixels are used and their errors, both (n, ny, nx)."""
+    used = (np.ones(pixels.shape, bool) if pixels.mask is None
+            else ~pixels.mask)
+    if pixels.error is None:
+        return used, np.broadcast_to(np.nan, pixels.shape)
+    check_errors(pixels.error, used)
+    return used, pixels.error
 
 
-def _measure_images(images, used, variance):
+def _measure_images(has_error, images, used, error):
     """Return one row for each image, see `_rows`."""
     states = np.array([_first_guess(*pair)
                        for pair in zip(images, used, strict=True)])
@@ -287,8 +292,8 @@ def _measure_images(images, used, variance):
                             largest, sums, status)
     status[~finite] = ShapeStatus.NOT_FINITE
     noise = np.full((len(images), 5), np.nan)
-    for i in np.flatnonzero((status == 0) & np.isfinite(variance[:, 0, 0])):
-        noise[i] = _noise(states[i], sums[i, 0], used[i], variance[i])
+    for i in np.flatnonzero((status == 0) & has_error):
+        noise[i] = _noise(states[i], sums[i, 0], used[i], error[i])
     return list(np.column_stack([states, sums[:, 0], noise, status]))
 
 
@@ -302,7 +307,7 @@ def _first_guess(image, used):
     return np.array([i, j, variance, 0, variance])
 
 
-def _noise(state, flux, used, variance):
+def _noise(state, flux, used, error):
     r"""
     Return the standard errors of x, y, R^2, e1 and e2.
 
@@ -323,7 +328,7 @@ def _noise(state, flux, used, variance):
     size = dxx + dyy
     moves = [2 * u, 2 * v, size, (dxx - dyy - e1 * size) / r2,
              (2 * dxy - e2 * size) / r2]
-    noise = np.where(used, variance, 0.0) * (weight / flux) ** 2
+    noise = np.square(np.where(used, error, 0.0)) * (weight / flux) ** 2
     return [np.sqrt((noise * move**2).sum()) for move in moves]
 
 

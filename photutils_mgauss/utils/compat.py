@@ -73,12 +73,11 @@ def prepare_inputs(photometry, data, mask, error, init_params):
                                           init_params=init_params)
 
 
-def split_nddata(data, mask, error):
-    """Return data, mask and error of an NDData object."""
+def check_nddata(mask, error):
+    """Refuse what photutils refuses beside an NDData object."""
     check = getattr(PSFPhotometry, '_check_nddata_kwargs', None)
     if check is not None:
         check(mask=mask, error=error)
-    return PSFPhotometry._coerce_nddata(data)
 
 
 def reset(photometry):

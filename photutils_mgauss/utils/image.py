@@ -1,93 +1,374 @@
-"""An image as users give it: data, errors, masks, units."""
-from dataclasses import dataclass
+"""
+Pixels as users give them: data, errors, mask and unit, read once for all.
 
+Every public call that takes pixels reads them here, so that all accept the
+same: plain arrays and nested lists of any number type, byte and memory order;
+masked arrays, whose mask counts; quantities, whose unit comes back with the
+result; `~astropy.nddata.NDData` with its mask, its unit and an uncertainty of
+any kind. Nothing that a user gives is changed, and an image is copied only
+where the call would have to copy it anyway.
+"""
+from dataclasses import dataclass, replace
+from functools import reduce
+
+import astropy.units as u
 import numpy as np
 from astropy.nddata import NDData, StdDevUncertainty
 from astropy.stats import mad_std
-from astropy.units import Quantity
+from astropy.utils.masked import Masked
 
-from photutils_mgauss.utils.validation import as_image
+from photutils_mgauss.utils.validation import as_real
 
-# Statistics of larger images are those of evenly spaced pixels.
+# Statistics of larger images are those of evenly spaced rows.
 _SAMPLE = 1 << 23
+_GAIN_SAMPLE = 1 << 18
+# How much the variance may scatter about a line in the data, as a fraction of
+# the scatter of an expected variance, to be made from these very data.
+_OWN_VARIANCE = 0.3
 
 
-@dataclass(frozen=True)
-class Image:
+@dataclass(frozen=True, eq=False)
+class PixelData:
     """
-    The arrays that a user gives, not copied, and a unit or None.
+    The pixels of one image, or of a stack of n.
 
-    ``data`` and ``error`` are (ny, nx), ``bad`` is (ny, nx) or None.
+    Attributes
+    ----------
+    data : (ny, nx) or (n, ny, nx) `~numpy.ndarray`
+        Real numbers of at most 64 bits, in any byte and memory order; the
+        array of the user where that is one.
+    error : `~numpy.ndarray` or None
+        Of the same shape, in the unit of the data.
+    mask : `~numpy.ndarray` of bool or None
+        Of the same shape, True for pixels to leave out.
+    unit : `~astropy.units.UnitBase` or None
+        Of the data.
     """
 
     data: np.ndarray
-    error: np.ndarray
-    bad: np.ndarray | None
-    unit: object
-
-    @classmethod
-    def of(cls, data, error, mask):
-        """Check what a user gives."""
-        if isinstance(data, NDData):
-            return cls._of_nddata(data, error, mask)
-        unit = data.unit if isinstance(data, Quantity) else None
-        if isinstance(error, Quantity):
-            error = error.to_value(unit) if unit is not None else error
-        values = as_image(data, 'data')
-        bad = None if mask is None else as_image(mask, 'mask', values.shape)
-        if np.ma.is_masked(data):
-            bad = np.ma.getmaskarray(data) | (False if bad is None
-                                              else bad.astype(bool))
-        if error is None:
-            error = np.broadcast_to(_estimate_noise(values, bad),
-                                    values.shape)
-        return cls(values, as_image(error, 'error', values.shape), bad, unit)
-
-    @classmethod
-    def _of_nddata(cls, data, error, mask):
-        values = data.data if data.unit is None else data.data * data.unit
-        if mask is None:
-            mask = data.mask
-        if error is None and data.uncertainty is not None:
-            error = data.uncertainty.represent_as(StdDevUncertainty)
-            unit = error.unit or data.unit
-            error = error.array if unit is None else error.array * unit
-        return cls.of(values, error, mask)
+    error: np.ndarray | None
+    mask: np.ndarray | None
+    unit: object = None
 
     @property
     def shape(self):
-        """The number of pixels along y and x."""
+        """The shape of the data."""
         return self.data.shape
+
+    def with_error(self):
+        """Return the image with one estimated error if it has none."""
+        if self.error is not None:
+            return self
+        noise = _estimate_noise(self.data, self.mask)
+        return replace(self, error=np.broadcast_to(noise, self.shape))
 
     def part(self, window=np.s_[:, :]):
         """Return data and variance of a window, both 0 at bad pixels."""
         data, error = (np.array(image[window], float, order='C')
                        for image in (self.data, self.error))
         bad = ~(np.isfinite(data) & np.isfinite(error) & (error > 0))
-        if self.bad is not None:
-            bad |= self.bad[window].astype(bool)
+        if self.mask is not None:
+            bad |= self.mask[window]
         data[bad] = error[bad] = 0
         return data, error**2
 
     def sample(self):
         """Return data and variance of good pixels, of large images some."""
-        data, variance = self.part(_spaced(self.shape))
+        data, variance = self.part(_spaced(self.shape, _SAMPLE))
         good = variance > 0
         return data[good], variance[good]
 
+    def gain(self):
+        """Return the gain the errors were made with, None if with none."""
+        slope, _ = photon_slope(*self.part(_spaced(self.shape, _GAIN_SAMPLE)))
+        return 1 / slope if slope > 0 else None
 
-def _spaced(shape):
-    """Return slices of every so many rows that do not exceed a sample."""
-    return np.s_[::max(1, -(-shape[0] * shape[1] // _SAMPLE))]
+
+def read_pixels(data, error=None, mask=None, *, name='data', broadcast=False):
+    """
+    Read one image.
+
+    Parameters
+    ----------
+    data, error, mask
+        What the user gives; ``error`` may be one number for all pixels. The
+        masks of ``data`` and ``error`` count beside ``mask``; ``error`` goes
+        before the uncertainty of an NDData.
+    name : str, optional
+        What the call calls ``data``, for messages.
+    broadcast : bool, optional
+        Whether ``error`` and ``mask`` may have any shape that broadcasts to
+        that of the image.
+
+    Returns
+    -------
+    PixelData
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not valid.
+    """
+    return _read(data, error, mask, name, (2,), broadcast)
 
 
-def _estimate_noise(values, bad):
+def read_stack(data, error=None, mask=None, *, name='image'):
+    """
+    Read one image or many of one shape; tell if it was one.
+
+    As `read_pixels` with ``broadcast``. The data are a copy, (n, ny, nx)
+    float64, contiguous.
+
+    Returns
+    -------
+    PixelData
+    single : bool
+    """
+    pixels = _read(data, error, mask, name, (2, 3), broadcast=True)
+    shape = (-1, *pixels.shape[-2:])
+    # What was a list is an array of our own already.
+    convert = np.asarray if isinstance(data, (list, tuple)) else np.array
+    return PixelData(
+        convert(pixels.data, np.float64, order='C').reshape(shape),
+        *(None if array is None else array.reshape(shape)
+          for array in (pixels.error, pixels.mask)),
+        pixels.unit), pixels.data.ndim == 2
+
+
+def read_quantity(value, name):
+    """
+    Return numbers of any shape as float64, NaN where masked, and their unit.
+
+    The unit of plain numbers is None.
+    """
+    array, mask, unit = _unwrap(_split(value, name)[0], name)
+    array = np.array(array, np.float64, order='C')
+    if mask is not None:
+        array[mask] = np.nan
+    return array, unit
+
+
+def read_values(value, name, unit):
+    """
+    Return numbers in the unit of an image as float64, NaN where masked.
+
+    Those without a unit of their own are taken to be in that of the image.
+    """
+    array, own = read_quantity(value, name)
+    return array if own is None else array * _factor(own, unit, name,
+                                                     'the image')
+
+
+def read_level(value, name, unit):
+    """Return one number in the unit of an image; see `read_values`."""
+    if isinstance(value, u.Quantity):
+        return as_real(read_values(value, name, unit), name)
+    return as_real(value, name)
+
+
+def with_unit(values, unit):
+    """Return values as a quantity, as they are if there is no unit."""
+    return values if unit is None else np.asarray(values) << unit
+
+
+def check_errors(error, used):
+    """Check that errors are positive and finite where pixels are used."""
+    bad = used & ~((error > 0) & np.isfinite(error))
+    if bad.any():
+        msg = (f'error must be positive and finite, got {error[bad][0]}; mask '
+               'pixels that must not be used')
+        raise ValueError(msg)
+
+
+# From what a user gives to plain arrays.
+
+def _read(data, error, mask, name, ndims, broadcast):
+    data, own_error = _split(data, name)
+    values, masked, unit = _unwrap(data, name)
+    _check_shape(values, name, ndims)
+    shape = values.shape
+    masks = [masked, _fit(_read_mask(mask), 'mask', name, shape, broadcast)]
+    error = own_error if error is None else error
+    if error is not None:
+        error, masked, own = _unwrap(error, 'error')
+        if own is not None or unit is not None:
+            factor = _factor(own, unit, 'error', name)
+            error = error if factor == 1 else error * factor
+        error = _fit(error, 'error', name, shape, broadcast)
+        masks.append(_fit(masked, 'error', name, shape, broadcast))
+    masks = [one for one in masks if one is not None]
+    mask = reduce(np.logical_or, masks) if masks else None
+    return PixelData(values, error, mask, unit)
+
+
+def _split(data, name):
+    """Return data with masks and units, and the errors that come along."""
+    if isinstance(data, NDData):
+        return _from_nddata(data, name)
+    if isinstance(data, (list, tuple)) and any(
+            isinstance(one, NDData) for one in data):
+        parts = [_split(one, name) for one in data]
+        errors = [error for _, error in parts if error is not None]
+        if len(errors) not in (0, len(parts)):
+            msg = (f'{name} must have an uncertainty in all images or in '
+                   f'none, got {len(errors)} in {len(parts)}')
+            raise ValueError(msg)
+        return [one for one, _ in parts], errors or None
+    return data, None
+
+
+def _from_nddata(nddata, name):
+    """Return the data with mask and unit, and the error or None."""
+    data = with_unit(nddata.data, nddata.unit)
+    if nddata.mask is not None:
+        mask = _fit(_read_mask(nddata.mask), 'mask', name, np.shape(data),
+                    broadcast=True)
+        data = Masked(data, mask)
+    if nddata.uncertainty is None:
+        return data, None
+    error = _standard_deviation(nddata.uncertainty, name)
+    return data, with_unit(error.array, error.unit or nddata.unit)
+
+
+def _standard_deviation(uncertainty, name):
+    """Return an uncertainty of any kind as a standard deviation."""
+    if isinstance(uncertainty, StdDevUncertainty):
+        return uncertainty
+    try:
+        # A pixel of no weight has an infinite error.
+        with np.errstate(divide='ignore'):
+            return uncertainty.represent_as(StdDevUncertainty)
+    except (TypeError, ValueError) as reason:
+        msg = (f'{name} must have an uncertainty that is a standard '
+               f'deviation, a variance or its inverse, got '
+               f'{type(uncertainty).__name__}')
+        raise ValueError(msg) from reason
+
+
+def _unwrap(value, name):
+    """Return the plain numbers, the mask and the unit of an argument."""
+    if isinstance(value, (list, tuple)) and any(map(_has_more, value)):
+        return _unwrap_list(value, name)
+    mask = unit = None
+    if isinstance(value, Masked):
+        value, mask = value.unmasked, value.mask
+    elif isinstance(value, np.ma.MaskedArray):
+        mask = None if value.mask is np.ma.nomask else value.mask
+        value = value.data
+    if isinstance(value, u.Quantity):
+        value, unit = value.value, value.unit
+        if unit.is_equivalent(u.one):
+            scale, unit = unit.to(u.one), None
+            value = value if scale == 1 else value * scale
+    return _numbers(value, name), mask, unit
+
+
+def _has_more(value):
+    return isinstance(value, (Masked, np.ma.MaskedArray, u.Quantity))
+
+
+def _unwrap_list(values, name):
+    """Unwrap a list of images, of which each may have a mask and a unit."""
+    parts = [_unwrap(one, name) for one in values]
+    unit = parts[0][2]
+    arrays = [array if own is None and unit is None
+              else array * _factor(own, unit, name, 'the first of them')
+              for array, _, own in parts]
+    masks = [np.zeros(array.shape, bool) if mask is None else mask
+             for array, mask, _ in parts]
+    shapes = {array.shape for array in arrays}
+    if len(shapes) > 1:
+        msg = f'{name} must hold images of one shape, got {sorted(shapes)}'
+        raise ValueError(msg)
+    return np.stack(arrays), np.stack(masks), unit
+
+
+def _numbers(value, name):
+    """Return an array of numbers, not copied if it is one."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as reason:
+        msg = f'{name} must be an array of numbers, got {value!r:.80}'
+        raise TypeError(msg) from reason
+    if array.dtype.kind not in 'buif':
+        got = array.dtype if array.ndim else f'{value!r:.80}'
+        msg = f'{name} must be an array of numbers, got {got}'
+        raise TypeError(msg)
+    if array.dtype.kind == 'b':
+        return array.view(np.uint8)
+    if array.dtype.kind == 'f' and array.dtype.itemsize not in (4, 8):
+        # Half precision has too few digits to compute with.
+        return array.astype(np.float32 if array.dtype.itemsize < 4
+                            else np.float64)
+    return array
+
+
+def _check_shape(array, name, ndims):
+    if array.ndim not in ndims or 0 in array.shape:
+        want = ('the shape (ny, nx)' if ndims == (2,)
+                else 'shape (ny, nx) or (n, ny, nx)')
+        msg = f'{name} must have {want} and pixels, got {array.shape}'
+        raise ValueError(msg)
+
+
+def _read_mask(mask):
+    """Return a mask as an array of bool, or None."""
+    if mask is None or mask is np.ma.nomask:
+        return None
+    if isinstance(mask, (np.ma.MaskedArray, Masked)):
+        mask = mask.filled(True)
+    mask = np.asarray(mask)
+    if mask.dtype.kind not in 'bui':
+        msg = f'mask must be an array of bool, got dtype {mask.dtype}'
+        raise TypeError(msg)
+    return mask.astype(bool, copy=False)
+
+
+def _fit(array, name, data_name, shape, broadcast):
+    """Return an array in the shape of the data, None if it is None."""
+    if array is None or array.shape == shape:
+        return array
+    if broadcast or (array.ndim == 0 and name == 'error'):
+        try:
+            return np.broadcast_to(array, shape)
+        except ValueError:
+            msg = (f'{name} must broadcast to the shape {shape[-2:]} of an '
+                   f'image, got {array.shape}')
+            raise ValueError(msg) from None
+    msg = (f'{name} must have the shape of {data_name}, {shape}, got '
+           f'{array.shape}')
+    raise ValueError(msg)
+
+
+def _factor(own, unit, name, data_name):
+    """Return what numbers in a unit of their own are in that of the data."""
+    if unit is None:
+        msg = f'{name} must have no unit, as {data_name} has none, got {own}'
+        raise ValueError(msg)
+    if own is None:
+        msg = f'{name} must have a unit, as {data_name} has {unit}, got none'
+        raise ValueError(msg)
+    try:
+        return own.to(unit)
+    except u.UnitConversionError as reason:
+        msg = f'{name} must have a unit like {unit}, got {own}'
+        raise ValueError(msg) from reason
+
+
+# What an image says of its noise.
+
+def _spaced(shape, size):
+    """Return slices of every so many rows that do not exceed a size."""
+    return np.s_[::max(1, -(-shape[0] * shape[1] // size))]
+
+
+def _estimate_noise(values, mask):
     """Return the scatter of the faint half of the pixels."""
-    rows = _spaced(values.shape)
+    rows = _spaced(values.shape, _SAMPLE)
     seen = values[rows].astype(float)
     good = np.isfinite(seen)
-    if bad is not None:
-        good &= ~bad[rows].astype(bool)
+    if mask is not None:
+        good &= ~mask[rows]
     seen = seen[good]
     if seen.size == 0:
         return 1.0
@@ -98,20 +379,41 @@ def _estimate_noise(values, bad):
     return noise if noise > 0 else max(seen.std(), 1.0)
 
 
-def find_gain(data, variance):
+def photon_slope(data, variance):
     """
-    Return the gain that ties variance to data (n,), None if nothing does.
+    Return how the variance grows with the data, and if it is clipped at 0.
 
-    An error map made from the data itself is a straight line over it.
+    The slope, one over the gain, is 0 unless the variance was computed from
+    these very pixels: an expected variance scatters about any line in the
+    data by their noise. Differences of neighbouring pixels keep gradients of
+    the sky out of this.
+
+    Parameters
+    ----------
+    data, variance : (..., n) `~numpy.ndarray`
+        Rows of neighbouring pixels; the variance is 0 where they are bad.
+
+    Returns
+    -------
+    slope : float
+    clipped : bool
+        Whether negative data count as 0.
     """
-    step = max(1, data.size // 20000)
-    data, variance = data[::step], variance[::step]
-    bright = data > np.median(data) if data.size else np.array([], bool)
-    data, variance = data[bright], variance[bright]
-    if data.size < 50 or np.ptp(data) == 0:
-        return None
-    slope, start = np.polyfit(data, variance, 1)
-    apart = np.abs(variance - start - slope * data)
-    if slope <= 0 or np.percentile(apart, 90) > 0.02 * slope * data.std():
-        return None
-    return 1 / slope
+    good = variance > 0
+    pairs = good[..., 1:] & good[..., :-1]
+    best, scatter = (0.0, True), _OWN_VARIANCE
+    if not pairs.any():
+        return best
+    change = np.diff(variance)[pairs]
+    noise = np.sqrt(np.median(variance[good]))
+    for clipped in (True, False):
+        light = np.maximum(data, 0) if clipped else data
+        step = np.diff(light)[pairs]
+        power = step @ step
+        slope = step @ change / power if power > 0 else 0.0
+        if slope <= 0:
+            continue
+        rest = np.median(np.abs(change - slope * step)) / (slope * noise)
+        if rest < scatter:
+            best, scatter = (slope, clipped), rest
+    return best

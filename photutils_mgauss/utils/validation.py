@@ -7,15 +7,36 @@ one star or stamp of many is not an error: it becomes NaN and a flag.
 """
 from numbers import Integral, Real
 
+import astropy.units as u
 import numpy as np
+
+
+def in_pixels(value, name):
+    """
+    Return numbers without unit, and masked ones as NaN.
+
+    The scale of pixels is not known, so that units other than powers of a
+    pixel are errors.
+    """
+    if isinstance(value, np.ma.MaskedArray):
+        value = np.ma.filled(value.astype(float), np.nan)
+    unit = getattr(value, 'unit', None)
+    if isinstance(unit, u.UnitBase):
+        if set(unit.bases) - {u.pix}:
+            msg = f'{name} must have no unit or be in pixels, got {unit}'
+            raise ValueError(msg)
+        value = u.Quantity(value).value
+    return value
 
 
 def as_floats(value, name, *, shape=None, finite=True):
     """
     Copy ``value`` into a new contiguous native float64 array.
 
-    ``shape`` is checked where given; None in it stands for any length.
+    ``shape`` is checked where given; None in it stands for any length. Units
+    are refused, see `in_pixels`; masked numbers are not finite.
     """
+    value = in_pixels(value, name)
     try:
         array = np.array(value, dtype=np.float64, order='C', copy=True)
     except (TypeError, ValueError) as error:
@@ -34,29 +55,6 @@ def as_floats(value, name, *, shape=None, finite=True):
         msg = f'{name} must be finite, got {bad}'
         raise ValueError(msg)
     return array
-
-
-def as_image(value, name, shape=None):
-    """Return an image without copying it: it may be large."""
-    value = np.asanyarray(value)
-    if value.dtype.kind not in 'buif':
-        msg = f'{name} must be an array of numbers, got {value.dtype}'
-        raise TypeError(msg)
-    if value.ndim != 2 or (shape is not None and value.shape != shape):
-        want = '(ny, nx)' if shape is None else f'that of data, {shape}'
-        msg = f'{name} must have the shape {want}, got {value.shape}'
-        raise ValueError(msg)
-    return np.asarray(value)
-
-
-def as_stack(value, name):
-    """Copy one image or many to float64 (n, ny, nx); tell if it was one."""
-    images = as_floats(value, name, finite=False)
-    if images.ndim not in (2, 3) or 0 in images.shape:
-        msg = (f'{name} must have shape (ny, nx) or (n, ny, nx) and pixels, '
-               f'got {images.shape}')
-        raise ValueError(msg)
-    return images.reshape(-1, *images.shape[-2:]), images.ndim == 2
 
 
 def as_real(value, name, *, above=None, minimum=None, maximum=None):

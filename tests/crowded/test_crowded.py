@@ -25,7 +25,7 @@ from photutils_mgauss.crowded.stars import Neighbours, Stars
 from photutils_mgauss.crowded.table import NOT_SEEN, REPEATED
 from photutils_mgauss.crowded.tile import Tile, TileJob, TileOptions
 from photutils_mgauss.psf.local import LocalPSF
-from photutils_mgauss.utils.image import Image
+from photutils_mgauss.utils.image import PixelData
 
 MIXTURE = GaussianMixture([0.8, 0.2], [[0, 0], [0.1, 0]],
                           [[[0.6, 0.05], [0.05, 0.5]], [[3, 0], [0, 3]]])
@@ -518,7 +518,7 @@ def test_masked_arrays_mask_pixels(crowd):
 
 def test_tiles_are_even_and_cover_the_image():
     for shape in ((9232, 9216), (2048, 2048), (500, 1700)):
-        image = Image(np.empty(shape), np.empty(shape), None, None)
+        image = PixelData(np.empty(shape), np.empty(shape), None, None)
         cores = Plan(image, None, OPTIONS, None, 48, None).cores
         sizes = np.array([(c[1] - c[0], c[3] - c[2]) for c in cores])
         assert sizes.prod(axis=1).sum() == np.prod(shape)
