@@ -9,32 +9,35 @@ import warnings
 
 import numpy as np
 from astropy.nddata import NDData
-from astropy.table import QTable, Table, vstack
+from astropy.table import Table
 from astropy.utils.exceptions import AstropyUserWarning
 
-from photutils_mgauss import kernels
-from photutils_mgauss.crowded import injection
-from photutils_mgauss.crowded.injection import InjectionResult
 from photutils_mgauss.crowded.plan import Plan, run
-from photutils_mgauss.crowded.table import REPEATED, StarTable, as_qtable
-from photutils_mgauss.crowded.tile import TileOptions
-from photutils_mgauss.psf.local import LocalPSF
-from photutils_mgauss.utils.image import Image, find_gain
-from photutils_mgauss.utils.validation import (
-    as_floats,
-    as_integer,
-    as_real,
-    as_shape,
+from photutils_mgauss.crowded.stars import Stars
+from photutils_mgauss.crowded.table import (
+    NO_COVARIANCE,
+    NO_OVERLAP,
+    REPEATED,
+    as_qtable,
+    no_stars,
+    plain,
+    positions,
 )
+from photutils_mgauss.crowded.tile import TileOptions
+from photutils_mgauss.psf.local import LocalPSF, as_grid
+from photutils_mgauss.psf.renderer import MixtureRenderer
+from photutils_mgauss.utils.image import Image, find_gain
+from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
-__all__ = ['CrowdedMixturePhotometry', 'InjectionResult',
-           'UnfinishedTilesError', 'inject_and_recover']
+__all__ = ['CrowdedMixturePhotometry', 'UnfinishedTilesError']
 
 _NAMES = {'x': ('x_init', 'x', 'x_fit', 'x_centroid', 'xcentroid'),
           'y': ('y_init', 'y', 'y_fit', 'y_centroid', 'ycentroid'),
           'flux': ('flux_init', 'flux', 'flux_fit')}
 # A PSF whose size is off by more than this fraction is warned of.
 _WIDTH_TOLERANCE = 0.1
+# Stars are drawn out to where this fraction of the noise is left of them.
+_FAINTEST = 1e-3
 
 
 class UnfinishedTilesError(RuntimeError):
@@ -225,7 +228,7 @@ class CrowdedMixturePhotometry:
         if xy_bounds is not None:
             self.xy_bounds = as_real(xy_bounds, 'xy_bounds', above=0)
         self.results = None
-        self._psf = _local_psf(psf_model)
+        self._psf = LocalPSF.of(psf_model)
 
     def __call__(self, data, *, mask=None, error=None, init_params=None):
         """
@@ -260,7 +263,7 @@ class CrowdedMixturePhotometry:
             If a worker failed; the finished tiles are in the error.
         """
         image = Image.of(data, error, mask)
-        given = None if init_params is None else _given(init_params)
+        given = None if init_params is None else self._listed(init_params)
         plan = Plan(image, self._psf, self._options(image), self.tile_shape,
                     self.overlap, given)
         outcomes, errors = run(plan, self.executor, self.progress_bar)
@@ -271,6 +274,14 @@ class CrowdedMixturePhotometry:
         if unfinished:
             raise UnfinishedTilesError(unfinished, self.results) from errors[0]
         return self.results
+
+    def _listed(self, init_params):
+        x, y, flux, number = _given(init_params)
+        return Stars(x, y, flux, number=number, bound=self._bound)
+
+    @property
+    def _bound(self):
+        return np.inf if self.xy_bounds is None else self.xy_bounds
 
     def _options(self, image):
         data, variance = image.sample()
@@ -286,20 +297,21 @@ class CrowdedMixturePhotometry:
             floor=float(variance.min()),
             noise=float(np.sqrt(np.median(variance))),
             max_rounds=self.maxiters, find_neighbors=self.find_neighbors,
-            xy_bounds=np.inf if self.xy_bounds is None else self.xy_bounds,
+            xy_bounds=self._bound,
             depth=self.depth, count_slope=self.count_slope)
 
     def _table(self, outcomes, given, unit):
         """Put the stars of the tiles together; empties the list."""
         done = [outcome for outcome in outcomes if outcome is not None]
         outcomes.clear()
-        stars = StarTable.joined([outcome.stars for outcome in done])
+        stars = Stars.joined([no_stars(),
+                              *(outcome.stars for outcome in done)])
         meta = self._report(done, stars)
         del done
         if given is not None:
             stars = _in_given_order(stars, given)
         else:
-            stars.sort('y_fit', 'x_fit')
+            stars.sort('y', 'x')
         return as_qtable(stars, unit, meta)
 
     def _report(self, done, stars):
@@ -346,15 +358,23 @@ class CrowdedMixturePhotometry:
             raise ValueError(msg)
         shape = as_shape(shape, 'shape')
         table = self.results
-        flux = np.asarray(getattr(table['flux_fit'], 'value',
-                                  table['flux_fit']), float)
-        flux = np.where(table['flags'] & REPEATED, 0, flux)
-        image = _draw(self._psf, table['x_fit'], table['y_fit'], flux, shape,
-                      psf_shape)
+        stars = np.array(positions(table))
+        stars[2, (table['flags'] & REPEATED) > 0] = 0
+        window = None if psf_shape is None else as_shape(psf_shape,
+                                                         'psf_shape')
+        image = MixtureRenderer(as_grid(self.psf_model)).image(
+            stars, _FAINTEST * self._noise_of(table), shape, window)
         if include_local_bkg and len(table):
             image += _nearest_background(table, shape)
         unit = getattr(table['flux_fit'], 'unit', None)
         return image if unit is None else image * unit
+
+    def _noise_of(self, table):
+        """Return the noise of a pixel; infinity if there are no stars."""
+        # That of a faint star's flux is that of so many pixels.
+        error = plain(table['flux_err'])
+        return (error[error > 0].min(initial=np.inf)
+                / np.sqrt(self._psf.area))
 
     def make_residual_image(self, data, *, psf_shape=None,
                             include_local_bkg=False):
@@ -379,23 +399,6 @@ class CrowdedMixturePhotometry:
             include_local_bkg=include_local_bkg)
 
 
-def _local_psf(model):
-    grid = getattr(model, '_grid', None)
-    if grid is not None:
-        return LocalPSF.from_nodes(
-            grid.x_grid, grid.y_grid, grid.weights * grid.scales[:, None],
-            grid.means, grid.covariances, model.pixel_integrated)
-    mixture = getattr(model, 'mixture', None)
-    if mixture is None:
-        msg = ('psf_model must be a GriddedMixturePSF or a '
-               f'MultiGaussianPSFModel, got {model!r:.80}')
-        raise TypeError(msg)
-    return LocalPSF.from_nodes(
-        np.zeros(1), np.zeros(1), mixture.weights[None],
-        mixture.means[None], mixture.covariances[None],
-        bool(model.pixel_integrated))
-
-
 def _given(table):
     """Return x, y, flux (NaN if unknown) and the row of each position."""
     table = Table(table)
@@ -415,179 +418,26 @@ def _given(table):
 
 def _in_given_order(stars, given):
     """Return one row for each position; NaN where nothing was fitted."""
-    x, y, flux, _ = given
-    n = x.size
+    n = len(given)
     columns = {}
-    for name, column in stars.columns.items():
+    for name, column in vars(stars).items():
         fill = np.nan if column.dtype.kind == 'f' else 0
         columns[name] = np.full(n, fill, column.dtype)
-        columns[name][stars.columns['number']] = column
+        columns[name][stars.number] = column
     missing = np.ones(n, bool)
-    missing[stars.columns['number']] = False
-    columns['flags'][missing] |= 16 | 64
-    columns['x_init'], columns['y_init'] = x, y
-    known = np.isfinite(flux)
-    columns['flux_init'] = np.where(known, flux, columns['flux_init'])
-    return StarTable(columns)
-
-
-def _draw(psf, x, y, flux, shape, psf_shape):
-    x, y = np.asarray(x, float), np.asarray(y, float)
-    good = np.isfinite(x) & np.isfinite(y) & np.isfinite(flux)
-    x, y, flux = x[good], y[good], flux[good]
-    image = np.zeros(shape)
-    if psf_shape is None:
-        wing = np.full(x.size, 30)
-    else:
-        wing = np.full(x.size, max(as_shape(psf_shape, 'psf_shape')) // 2)
-    one = np.ones(x.size, np.int64)
-    rows, count = psf.rows_at(x, y)
-    left, bottom = (np.rint(v).astype(np.int64) for v in (x, y))
-    faintest = 1e-7 * max(np.abs(flux).max(initial=0), 1e-300)
-    kernels.add_stars(np.arange(x.size), 1.0, x, y, flux, left, bottom, one,
-                      0 * one, wing.astype(np.int64), np.empty((3, 1)),
-                      rows, count, psf.integrated, faintest, image)
-    return image
+    missing[stars.number] = False
+    columns['flags'][missing] |= NO_COVARIANCE | NO_OVERLAP
+    columns['flux_init'] = np.where(np.isfinite(given.flux), given.flux,
+                                    columns['flux_init'])
+    return Stars.of_columns(columns).replaced(x_init=given.x, y_init=given.y)
 
 
 def _nearest_background(table, shape):
     from scipy.spatial import cKDTree
-    level = table['local_bkg']
-    level = np.asarray(getattr(level, 'value', level), float)
+    level = plain(table['local_bkg'])
     good = np.isfinite(level) & np.isfinite(table['x_fit'])
     tree = cKDTree(np.column_stack([table['x_fit'][good],
                                     table['y_fit'][good]]))
     y, x = np.indices(shape)
     nearest = tree.query(np.column_stack([x.ravel(), y.ravel()]))[1]
     return level[good][nearest].reshape(shape)
-
-
-def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
-                       separation=20, radius=0.7, flux_ratio=2.5,
-                       flux_edges=None, effective_gain=1.0, repeats=1,
-                       rng=None):
-    """
-    Add artificial stars to an image and see what is found of them.
-
-    The stars are drawn with the PSF of ``photometry``, with the noise of
-    their own light, on a jittered lattice so wide that they do not crowd one
-    another, and the image is reduced again as before.
-
-    Parameters
-    ----------
-    photometry : CrowdedMixturePhotometry
-        How the image is reduced.
-    data : (ny, nx) array_like
-        The image.
-    flux : (n,) array_like or (low, high) tuple of float
-        The fluxes of the stars of one repeat, or limits between which they
-        are drawn evenly in the logarithm, as many as there is room for.
-    mask, error
-        As in `CrowdedMixturePhotometry.__call__`.
-    separation : float, optional
-        The distance of artificial stars [pix].
-    radius : float, optional
-        How far from its place a star may be found [pix].
-    flux_ratio : float, optional
-        By which factor its flux may be off.
-    flux_edges : (m + 1,) array_like, optional
-        The edges of the bins of flux; by default about a magnitude wide.
-    effective_gain : float, optional
-        Electrons per unit of data, for the noise of the artificial stars.
-    repeats : int, optional
-        How often to do it.
-    rng : `~numpy.random.Generator` or int, optional
-        Randomness, or a seed.
-
-    Returns
-    -------
-    InjectionResult
-        With the tables ``stars`` and ``curves``.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is not valid.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from photutils_mgauss import (CrowdedMixturePhotometry,
-    ...                               GaussianMixture, GriddedMixturePSF,
-    ...                               inject_and_recover)
-    >>> mixture = GaussianMixture([1], [[0, 0]], [[[0.7, 0], [0, 0.8]]])
-    >>> phot = CrowdedMixturePhotometry(GriddedMixturePSF([mixture],
-    ...                                                   [(0, 0)]))
-    >>> data = np.random.default_rng(1).normal(100, 10, (60, 60))
-    >>> result = inject_and_recover(phot, data, (3000, 9000), rng=2,
-    ...                             error=np.full((60, 60), 10.0))
-    >>> result.curves['completeness']
-    <Column name='completeness' dtype='float64' length=1>
-    1.0
-    """
-    rng = np.random.default_rng(rng)
-    image, variance = Image.of(data, error, mask).part()
-    gain = as_real(effective_gain, 'effective_gain', above=0)
-    repeats = as_integer(repeats, 'repeats', minimum=1)
-    separation = as_real(separation, 'separation', minimum=5)
-    before = photometry(data, mask=mask, error=error)
-    known = _positions(before)
-    tables = []
-    for _ in range(repeats):
-        true = _artificial(variance, flux, separation, rng)
-        light = _draw(photometry._psf, *true, image.shape, None)
-        noisy = rng.poisson(np.maximum(light, 0) * gain) / gain
-        table = photometry(image + noisy, mask=variance == 0,
-                           error=np.sqrt(variance + light / gain))
-        row = injection.match(true, _positions(table), known, radius,
-                              flux_ratio)
-        tables.append(_injected(true, table, row))
-    photometry.results = before
-    stars = vstack(tables)
-    if flux_edges is None:
-        flux_edges = _flux_edges(np.asarray(stars['flux_true']))
-    return InjectionResult(stars, injection.curves(stars, flux_edges))
-
-
-def _artificial(variance, flux, separation, rng):
-    """Draw x, y and flux of the artificial stars of one repeat."""
-    limits = isinstance(flux, tuple)
-    flux = np.atleast_1d(as_floats(flux, 'flux'))
-    if not (flux > 0).all():
-        msg = f'flux must be positive, got {flux.min()}'
-        raise ValueError(msg)
-    n = variance.size if limits else flux.size
-    x, y = injection.place_stars(variance.shape, variance == 0, n, separation,
-                                 rng)
-    if limits:
-        flux = np.exp(rng.uniform(*np.log(flux), x.size))
-    elif x.size < flux.size:
-        msg = (f'flux must not hold more stars than fit {separation} pixels '
-               f'apart, {x.size}, got {flux.size}')
-        raise ValueError(msg)
-    return x, y, flux
-
-
-def _positions(table):
-    return tuple(np.asarray(getattr(table[name], 'value', table[name]), float)
-                 for name in ('x_fit', 'y_fit', 'flux_fit'))
-
-
-def _injected(true, table, row):
-    out = QTable(dict(zip(('x_true', 'y_true', 'flux_true'), true,
-                          strict=True)))
-    found = row >= 0
-    out['recovered'] = found
-    for name in ('x_fit', 'y_fit', 'flux_fit', 'x_err', 'y_err', 'flux_err'):
-        column = np.full(row.size, np.nan)
-        values = getattr(table[name], 'value', table[name])
-        column[found] = np.asarray(values, float)[row[found]]
-        out[name] = column
-    out['flags'] = np.zeros(row.size, int)
-    out['flags'][found] = np.asarray(table['flags'])[row[found]]
-    return out
-
-
-def _flux_edges(flux):
-    n = max(1, round(2.5 * np.log10(flux.max() / flux.min())))
-    return np.geomspace(flux.min(), flux.max() * (1 + 1e-9), n + 1)

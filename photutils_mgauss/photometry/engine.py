@@ -78,7 +78,7 @@ def psf_arrays(model):
 
     Returns
     -------
-    nodes, paces, x_grid, y_grid, integrated : tuple
+    nodes, strides, x_grid, y_grid, integrated : tuple
         The mixtures at the nodes (M, K, 6), what the kernels precompute of
         them (M, K, 4), the axes of the grid, and whether they are integrated
         over pixels.
@@ -91,9 +91,9 @@ def psf_arrays(model):
         x_grid = y_grid = np.zeros(1)
     rows, x_grid, y_grid = (_as_kernels_take(a, np.float64)
                             for a in (rows, x_grid, y_grid))
-    paces = np.empty((*rows.shape[:2], 4))
-    kernels.strides(rows, paces)
-    return rows, paces, x_grid, y_grid, model.pixel_integrated
+    strides = np.empty((*rows.shape[:2], 4))
+    kernels.strides(rows, strides)
+    return rows, strides, x_grid, y_grid, model.pixel_integrated
 
 
 def is_fixed_shape(model):

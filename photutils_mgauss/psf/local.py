@@ -8,9 +8,11 @@ covariance of its family can stand for it, K Gaussians do.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from photutils_mgauss import kernels
+from photutils_mgauss.psf.grid import match
+from photutils_mgauss.psf.gridded import GriddedMixturePSF
+from photutils_mgauss.psf.rows import kernel_rows
 
 MAX_WING = 60
 # A cell's families are merged if that changes no pixel by more than this
@@ -18,14 +20,17 @@ MAX_WING = 60
 _MERGE_TOLERANCE = 1e-3
 
 
-def _rows(weights, means, covariances):
-    """Return the kernels' rows of arrays of Gaussians (..., 6)."""
-    sxx = covariances[..., 0, 0]
-    sxy = covariances[..., 0, 1]
-    syy = covariances[..., 1, 1]
-    det = sxx * syy - sxy**2
-    return np.stack([weights / (2 * np.pi * np.sqrt(det)), means[..., 0],
-                     means[..., 1], syy / det, sxy / syy, 1 / syy], axis=-1)
+def as_grid(model):
+    """Return a PSF model as a grid; one mixture is a grid of one node."""
+    if isinstance(model, GriddedMixturePSF):
+        return model
+    mixture = getattr(model, 'mixture', None)
+    if mixture is None:
+        msg = ('psf_model must be a GriddedMixturePSF or a '
+               f'MultiGaussianPSFModel, got {model!r:.80}')
+        raise TypeError(msg)
+    return GriddedMixturePSF([mixture], [(0, 0)],
+                             pixel_integrated=model.pixel_integrated)
 
 
 def cells(position, nodes):
@@ -77,6 +82,15 @@ class LocalPSF:
         return replace(psf, profile=_profile(stamp),
                        area=stamp.sum()**2 / (stamp**2).sum())
 
+    @classmethod
+    def of(cls, model):
+        """Return the PSF of a GriddedMixturePSF or MultiGaussianPSFModel."""
+        psf = as_grid(model)
+        grid = psf._grid
+        return cls.from_nodes(
+            grid.x_grid, grid.y_grid, grid.weights * grid.scales[:, None],
+            grid.means, grid.covariances, psf.pixel_integrated)
+
     @property
     def n_rows(self):
         """The largest number of Gaussians of a star."""
@@ -95,15 +109,11 @@ class LocalPSF:
                          j_next * n + i_next], axis=-1)
 
     def _join_families(self, j, i):
-        corners = self._corners(j, i)
-        features = np.concatenate([
-            self.weights[..., None], self.means,
-            self.covariances.reshape(*self.weights.shape, 4)], axis=-1)
-        first = features[corners[0]]
-        for c in range(1, 4):
-            other = features[corners[c]]
-            cost = ((first[:, None] - other) ** 2).sum(axis=-1)
-            self.order[j, i, c] = linear_sum_assignment(cost)[1]
+        stack = (self.weights, self.means, self.covariances)
+        first, *others = ([array[corner] for array in stack]
+                          for corner in self._corners(j, i))
+        for c, other in enumerate(others, 1):
+            self.order[j, i, c] = match(first, other)
         x, y = self._middle(j, i)
         exact = self._stamp(*self.rows_at(x, y))
         self.merged[j, i] = True
@@ -150,16 +160,16 @@ class LocalPSF:
         rows[one, :k] = _merge(weights[one], means[one], covariances[one])
         four = ~merged
         if four.any():
-            rows[four] = _rows(weights, means, covariances)[four].reshape(
-                -1, 4 * k, 6)
+            rows[four] = kernel_rows(weights[four], means[four],
+                                     covariances[four]).reshape(-1, 4 * k, 6)
         return rows, count
 
-    @staticmethod
-    def paces(rows):
-        """Return what the kernels' walks over Gaussians need beside rows."""
-        out = np.empty((*rows.shape[:2], 4))
-        kernels.strides(rows, out)
-        return out
+    def gaussians_at(self, x, y):
+        """Return the PSFs of stars at positions (n,) for the kernels."""
+        rows, count = self.rows_at(x, y)
+        strides = np.empty((*rows.shape[:2], 4))
+        kernels.strides(rows, strides)
+        return kernels.Gaussians(rows, strides, count, self.integrated)
 
     def stamp(self, x, y, half):
         """Draw a star of unit flux in the middle of a stamp."""
@@ -190,4 +200,5 @@ def _merge(weights, means, covariances):
     mean = (part[..., None] * means).sum(axis=1)
     offset = means - mean[:, None]
     spread = covariances + offset[..., :, None] * offset[..., None, :]
-    return _rows(total, mean, (part[..., None, None] * spread).sum(axis=1))
+    return kernel_rows(total, mean,
+                       (part[..., None, None] * spread).sum(axis=1))

@@ -33,7 +33,7 @@ from photutils_mgauss.simulation.image import Chip, draw, expose, read
 from photutils_mgauss.simulation.instrument import CSST_BANDS, Band, Instrument
 from photutils_mgauss.simulation.mock_psf import csst_psf
 from photutils_mgauss.simulation.optics import Optics
-from photutils_mgauss.simulation.renderer import brush_of, widen
+from photutils_mgauss.simulation.renderer import renderer_of, widen
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = [
@@ -328,7 +328,7 @@ def _catalogue(sources, exposure, instrument, psf, threshold, rng, executor):
     truth = _truth(sources, exposure, instrument, wcs)
     sky = instrument.sky(exposure.band)
     flux = truth['flux'].value
-    peak = brush_of(psf).peak
+    peak = renderer_of(psf).peak
     truth = truth[truth['inside'] & (flux > 0)
                   & (flux * peak + sky < instrument.full_well)]
     bounds = covariances(
