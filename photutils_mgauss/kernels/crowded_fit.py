@@ -411,20 +411,21 @@ def put_block(block, row, column, a):
 
 
 @kernel
-def _members(i, pairs, members):
+def _members(i, indptr, neighbour, members):
     """Put a star and its first neighbours into members; return how many."""
     members[0] = i
     count = 1
-    for pair in range(pairs.indptr[i], pairs.indptr[i + 1]):
+    for pair in range(indptr[i], indptr[i + 1]):
         if count == members.size:
             break
-        members[count] = pairs.neighbour[pair]
+        members[count] = neighbour[pair]
         count += 1
     return count
 
 
 @kernel
-def _joint_matrix(members, count, stars, pairs, where, a):
+def _joint_matrix(members, count, matrix, blocks, indptr, neighbour, where,
+                  a):
     """
     Put the normal matrix of some stars into a (3 count, 3 count).
 
@@ -437,11 +438,11 @@ def _joint_matrix(members, count, stars, pairs, where, a):
             a[r, c] = 0.0
     for m in range(count):
         star = members[m]
-        put_block(stars.matrix[star], m, m, a)
-        for pair in range(pairs.indptr[star], pairs.indptr[star + 1]):
-            other = where[pairs.neighbour[pair]]
+        put_block(matrix[star], m, m, a)
+        for pair in range(indptr[star], indptr[star + 1]):
+            other = where[neighbour[pair]]
             if other >= 0:
-                put_block(stars.blocks[pair], m, other, a)
+                put_block(blocks[pair], m, other, a)
     for m in range(count):
         where[members[m]] = -1
 
@@ -468,7 +469,9 @@ def joint_covariances(stars, pairs, partner, covariance, correlation):
     neighbours. A star's normal matrix is that of itself and up to 12 of its
     neighbours, those that come first. NaN where it is singular.
     """
-    n = stars.matrix.shape[0]
+    matrix, _, _, blocks = stars
+    indptr, neighbour, _ = pairs
+    n = matrix.shape[0]
     members = np.empty(_MOST_FREE, np.int64)
     where = np.full(n, -1, np.int64)
     a = np.empty((3 * _MOST_FREE, 3 * _MOST_FREE))
@@ -476,9 +479,10 @@ def joint_covariances(stars, pairs, partner, covariance, correlation):
     columns = np.empty((3 * _MOST_FREE, 3))
     alone = np.empty((3 * _MOST_FREE, 1))
     for i in range(n):
-        count = _members(i, pairs, members)
+        count = _members(i, indptr, neighbour, members)
         size = 3 * count
-        _joint_matrix(members, count, stars, pairs, where, a)
+        _joint_matrix(members, count, matrix, blocks, indptr, neighbour, where,
+                      a)
         _scale_matrix(a, size, scale)
         correlation[i] = 0.0
         solved = scale[0] > 0 and _cholesky(a, size)

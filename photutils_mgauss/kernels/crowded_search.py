@@ -112,13 +112,12 @@ def score(residual, weight, template, x_low, x_high, y_low, y_high, hint,
 
 
 @kernel
-def _template_products(x, y, template, planes, out):
+def _template_products(x, y, template, weight, residual, light, out):
     """
     Put the sums of t w r, t^2 w and (t w light)^2 around a pixel into out.
 
     False where weights of zero leave less than a third of the information.
     """
-    weight, residual, light = planes
     ny, nx = residual.shape
     h = template.shape[0] // 2
     tr = tt = tl = seen = power = 0.0
@@ -166,20 +165,18 @@ def _template_overlap(x, y, template, weight, star, flux, stamps, out):
 
 
 @kernel
-def _stars_around(x, y, i, reach, sources, pairs, members):
+def _stars_around(column, row, i, x, y, indptr, neighbour, members):
     """
     Put the stars around a pixel into members; return how many.
 
-    None if star i is not within reach of it, or not the nearest.
+    None if another than star i is nearest to it.
     """
-    gap = (sources.x[i] - x)**2 + (sources.y[i] - y)**2
-    if gap > reach * reach:
-        return 0
+    gap = (x[i] - column)**2 + (y[i] - row)**2
     members[0] = i
     count = 1
-    for pair in range(pairs.indptr[i], pairs.indptr[i + 1]):
-        j = pairs.neighbour[pair]
-        other = (sources.x[j] - x)**2 + (sources.y[j] - y)**2
+    for pair in range(indptr[i], indptr[i + 1]):
+        j = neighbour[pair]
+        other = (x[j] - column)**2 + (y[j] - row)**2
         if other < gap:
             return 0
         if other < _FREE_DISTANCE * _FREE_DISTANCE and count < members.size:
@@ -245,24 +242,19 @@ def _readjust(size, scratch):
 
 
 @kernel
-def _score_pixel(x, y, count, fit, template, planes, limits, scratch):
+def _score_pixel(x, y, count, fit, template, weight, least, scratch):
     """Return significance and flux of a star at a pixel, or zeros."""
     members, a, right, sums = scratch
-    if not _template_products(x, y, template, planes, sums):
-        return 0.0, 0.0
-    # What the stars' freedom can add is bounded.
-    if not sums[0] > limits.threshold * sqrt(0.3 * limits.least * sums[1]):
-        return 0.0, 0.0
     for m in range(count):
         star = members[m]
-        _template_overlap(x, y, template, planes.weight, star,
+        _template_overlap(x, y, template, weight, star,
                           fit.sources.flux[star], fit.stamps, right[3 * m:])
     _gather(count, fit, scratch)
     _scale(a, right, 3 * count)
     if not _cholesky(a, 3 * count):
         return 0.0, 0.0
     info, g = _readjust(3 * count, scratch)
-    if info < limits.least * sums[1]:
+    if info < least * sums[1]:
         return 0.0, 0.0
     return g / sqrt(info + sums[2]), g / info
 
@@ -285,27 +277,38 @@ def score_beside(fit, templates, planes, limits, significance, flux):
     and flux are (ny, nx).
     """
     ny, nx = significance.shape
+    px, py, _ = fit.sources
+    indptr, neighbour, _ = fit.pairs
+    weight, residual, light = planes
+    stamps, cell = templates
+    reach, least, threshold = limits
     size = 3 * _MOST_FREE
-    scratch = _Scratch(np.empty(_MOST_FREE, np.int64), np.empty((size, size)),
-                       np.empty((size, 2)), np.empty(3))
-    sources = fit.sources
-    side = int(ceil(limits.reach))
-    for i in range(sources.x.size):
-        row, column = int(np.rint(sources.y[i])), int(np.rint(sources.x[i]))
+    members, sums = np.empty(_MOST_FREE, np.int64), np.empty(3)
+    scratch = _Scratch(members, np.empty((size, size)), np.empty((size, 2)),
+                       sums)
+    side = int(ceil(reach))
+    for i in range(px.size):
+        row, column = int(np.rint(py[i])), int(np.rint(px[i]))
         for y in range(max(0, row - side), min(ny, row + side + 1)):
             for x in range(max(0, column - side),
                            min(nx, column + side + 1)):
-                count = _stars_around(x, y, i, limits.reach, sources,
-                                      fit.pairs, scratch.members)
+                if (px[i] - x)**2 + (py[i] - y)**2 > reach * reach:
+                    continue
+                count = _stars_around(x, y, i, px, py, indptr, neighbour,
+                                      members)
                 if count == 0:
                     continue
-                template = templates.stamps[y // templates.cell,
-                                            x // templates.cell]
-                strength, light = _score_pixel(x, y, count, fit, template,
-                                               planes, limits, scratch)
-                significance[y, x] = strength
-                if light != 0:
-                    flux[y, x] = light
+                significance[y, x] = 0.0
+                template = stamps[y // cell, x // cell]
+                # What the stars' freedom can add is bounded.
+                if _template_products(
+                        x, y, template, weight, residual, light, sums) and (
+                        sums[0] > threshold * sqrt(0.3 * least * sums[1])):
+                    strength, brightness = _score_pixel(
+                        x, y, count, fit, template, weight, least, scratch)
+                    if brightness != 0:
+                        significance[y, x] = strength
+                        flux[y, x] = brightness
 
 
 @kernel

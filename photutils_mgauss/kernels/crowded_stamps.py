@@ -52,6 +52,7 @@ class Stamps(NamedTuple):
 @kernel
 def star_stamps(chosen, sources, stamps, gaussians):
     """Fill the stamps of the chosen stars."""
+    x, y, _ = sources
     left, bottom, width, offset, derivatives = stamps
     rows, strides, count, integrated = gaussians
     widest = 0
@@ -67,8 +68,8 @@ def star_stamps(chosen, sources, stamps, gaussians):
             clear(tile, 3 * LANES * w)
             for k in range(count[i]):
                 a, mx, my, p, s, q = rows[i, k]
-                add_gaussian(a, left[i] - sources.x[i] - mx,
-                             bottom[i] + first - sources.y[i] - my, p, s, q,
+                add_gaussian(a, left[i] - x[i] - mx,
+                             bottom[i] + first - y[i] - my, p, s, q,
                              strides[i, k], 0.0, 0.0, integrated, height, w,
                              walk, tile)
             for j in range(height):
@@ -171,20 +172,23 @@ def add_stars(chosen, sign, sources, stamps, wing, gaussians, faintest,
     copied from it.
     """
     ny, nx = image.shape
+    x, y, fluxes = sources
+    lefts, bottoms, widths, offset, derivatives = stamps
+    rows, _, count, integrated = gaussians
     scratch = np.empty((3, ERRORS.size))
     lanes = np.empty((4, nx))
     for i in chosen:
-        left, bottom, w = stamps.left[i], stamps.bottom[i], stamps.width[i]
-        flux = sign * sources.flux[i]
+        left, bottom, w = lefts[i], bottoms[i], widths[i]
+        flux = sign * fluxes[i]
         grow = wing[i] - w // 2
         if grow <= 0:
             _add_stamp(left, bottom, w, flux,
-                       stamps.derivatives[0, stamps.offset[i]:], image)
+                       derivatives[0, offset[i]:], image)
             continue
         x_low, x_high = max(0, left - grow), min(nx, left + w + grow)
         y_low, y_high = max(0, bottom - grow), min(ny, bottom + w + grow)
         if x_low < x_high and y_low < y_high:
-            add_wings(gaussians.rows[i, :gaussians.count[i]], flux,
-                      sources.x[i] - x_low, sources.y[i] - y_low,
-                      gaussians.integrated, faintest, lanes, scratch,
+            add_wings(rows[i, :count[i]], flux,
+                      x[i] - x_low, y[i] - y_low,
+                      integrated, faintest, lanes, scratch,
                       image[y_low:y_high, x_low:x_high])
