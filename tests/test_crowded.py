@@ -291,6 +291,36 @@ def test_the_residual_image_is_noise(crowd):
     assert 1.4826 * np.median(np.abs(chi)) < 1.15
 
 
+def wide_winged():
+    """Return photometry of a bright star with wide wings, and its truth."""
+    mixture = GaussianMixture([0.9, 0.1], np.zeros((2, 2)),
+                              [np.eye(2), 144 * np.eye(2)])
+    y, x = np.indices((111, 111))
+    true = 1e7 * mixture.evaluate(x - 55, y - 55)
+    error = np.sqrt(true + 100)
+    phot = CrowdedMixturePhotometry(GriddedMixturePSF([mixture], [(0, 0)]),
+                                    background_size=None)
+    phot(true, error=error)
+    return phot, true
+
+
+def test_the_model_image_has_all_of_the_wings_that_can_be_seen():
+    phot, true = wide_winged()
+    model = phot.make_model_image(true.shape)
+    assert true[55, 86] == pytest.approx(39.3, abs=0.1)
+    # A hundredth of the noise.
+    assert_allclose(model, true, rtol=1e-3, atol=0.1)
+
+
+def test_the_model_image_has_no_more_of_a_star_than_is_asked_for():
+    phot, true = wide_winged()
+    model = phot.make_model_image(true.shape, psf_shape=(9, 21))
+    inside = np.zeros(true.shape, bool)
+    inside[51:60, 45:66] = True
+    assert_allclose(model[inside], true[inside], rtol=1e-3)
+    assert not model[~inside].any()
+
+
 def test_given_positions_are_fitted_in_their_order(crowd):
     data, error, x, y, flux = crowd
     bright = np.flatnonzero((flux > 3000) & (x > 2) & (y > 2) & (x < 137)

@@ -228,6 +228,8 @@ class CrowdedMixturePhotometry:
         if xy_bounds is not None:
             self.xy_bounds = as_real(xy_bounds, 'xy_bounds', above=0)
         self.results = None
+        # That of a pixel of the last image.
+        self._noise = np.inf
         self._psf = LocalPSF.of(psf_model)
 
     def __call__(self, data, *, mask=None, error=None, init_params=None):
@@ -264,8 +266,10 @@ class CrowdedMixturePhotometry:
         """
         image = Image.of(data, error, mask)
         given = None if init_params is None else self._listed(init_params)
-        plan = Plan(image, self._psf, self._options(image), self.tile_shape,
-                    self.overlap, given)
+        options = self._options(image)
+        self._noise = options.noise
+        plan = Plan(image, self._psf, options, self.tile_shape, self.overlap,
+                    given)
         outcomes, errors = run(plan, self.executor, self.progress_bar)
         unfinished = [core for core, outcome in zip(plan.cores, outcomes,
                                                     strict=True)
@@ -363,18 +367,11 @@ class CrowdedMixturePhotometry:
         window = None if psf_shape is None else as_shape(psf_shape,
                                                          'psf_shape')
         image = MixtureRenderer(as_grid(self.psf_model)).image(
-            stars, _FAINTEST * self._noise_of(table), shape, window)
+            stars, _FAINTEST * self._noise, shape, window)
         if include_local_bkg and len(table):
             image += _nearest_background(table, shape)
         unit = getattr(table['flux_fit'], 'unit', None)
         return image if unit is None else image * unit
-
-    def _noise_of(self, table):
-        """Return the noise of a pixel; infinity if there are no stars."""
-        # That of a faint star's flux is that of so many pixels.
-        error = plain(table['flux_err'])
-        return (error[error > 0].min(initial=np.inf)
-                / np.sqrt(self._psf.area))
 
     def make_residual_image(self, data, *, psf_shape=None,
                             include_local_bkg=False):

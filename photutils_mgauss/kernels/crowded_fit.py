@@ -154,14 +154,14 @@ def list_near(x, y, reach, cells, pairs, distance):
                 end += 1
     for i in range(x.size):
         for pair in range(indptr[i], indptr[i + 1]):
-            twin[pair] = find_pair(neighbour[pair], i, pairs)
+            twin[pair] = find_pair(neighbour[pair], i, indptr, neighbour)
 
 
 @kernel
-def find_pair(i, j, pairs):
+def find_pair(i, j, indptr, neighbour):
     """Return where star j stands among the neighbours of i, -1 for nowhere."""
-    for pair in range(pairs.indptr[i], pairs.indptr[i + 1]):
-        if pairs.neighbour[pair] == j:
+    for pair in range(indptr[i], indptr[i + 1]):
+        if neighbour[pair] == j:
             return pair
     return -1
 
@@ -403,11 +403,11 @@ def solve_joint(stars, pairs, mesh, tolerance, max_steps, step, mesh_step):
 
 
 @kernel
-def put_block(block, row, column, a):
-    """Put a block (3, 3) into a matrix of blocks."""
+def put_block(blocks, which, row, column, a):
+    """Put one of blocks (n, 3, 3) into a matrix of blocks."""
     for r in range(3):
         for c in range(3):
-            a[3 * row + r, 3 * column + c] = block[r, c]
+            a[3 * row + r, 3 * column + c] = blocks[which, r, c]
 
 
 @kernel
@@ -438,11 +438,11 @@ def _joint_matrix(members, count, matrix, blocks, indptr, neighbour, where,
             a[r, c] = 0.0
     for m in range(count):
         star = members[m]
-        put_block(matrix[star], m, m, a)
+        put_block(matrix, star, m, m, a)
         for pair in range(indptr[star], indptr[star + 1]):
             other = where[neighbour[pair]]
             if other >= 0:
-                put_block(blocks[pair], m, other, a)
+                put_block(blocks, pair, m, other, a)
     for m in range(count):
         where[members[m]] = -1
 

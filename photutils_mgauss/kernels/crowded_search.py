@@ -142,11 +142,9 @@ def _template_products(x, y, template, weight, residual, light, out):
 
 
 @kernel
-def _template_overlap(x, y, template, weight, star, flux, stamps, out):
-    """Put the sums of t w times a star's derivatives into out (3, ...)."""
-    derivatives = stamps.derivatives
-    left, bottom = stamps.left[star], stamps.bottom[star]
-    width, offset = stamps.width[star], stamps.offset[star]
+def _template_overlap(x, y, template, weight, left, bottom, width, offset,
+                      derivatives, out):
+    """Put the sums of t w times derivatives of a star into out (3, ...)."""
     ny, nx = weight.shape
     h = template.shape[0] // 2
     o0 = o1 = o2 = 0.0
@@ -160,8 +158,8 @@ def _template_overlap(x, y, template, weight, star, flux, stamps, out):
             o1 += tw * derivatives[1, first + k]
             o2 += tw * derivatives[2, first + k]
     out[0, 0] = o0
-    out[1, 0] = flux * o1
-    out[2, 0] = flux * o2
+    out[1, 0] = o1
+    out[2, 0] = o2
 
 
 @kernel
@@ -186,19 +184,18 @@ def _stars_around(column, row, i, x, y, indptr, neighbour, members):
 
 
 @kernel
-def _gather(count, fit, scratch):
-    """Put the equations of the stars around a pixel into the scratch."""
-    members, a, right, _ = scratch
-    equations = fit.equations
+def _gather(count, members, equations, indptr, neighbour, a, right):
+    """Put the equations of the stars around a pixel into a and right."""
+    matrix, gradient, _, blocks = equations
     for m in range(count):
         star = members[m]
         for c in range(3):
-            right[3 * m + c, 1] = equations.gradient[star, c]
-        put_block(equations.matrix[star], m, m, a)
+            right[3 * m + c, 1] = gradient[star, c]
+        put_block(matrix, star, m, m, a)
         for n in range(m):
-            pair = find_pair(star, members[n], fit.pairs)
+            pair = find_pair(star, members[n], indptr, neighbour)
             if pair >= 0:
-                put_block(equations.blocks[pair], m, n, a)
+                put_block(blocks, pair, m, n, a)
                 continue
             for c in range(3):
                 for d in range(3):
@@ -220,14 +217,13 @@ def _scale(a, right, size):
 
 
 @kernel
-def _readjust(size, scratch):
+def _readjust(size, a, right, sums):
     """
     Return information and gradient of a star with the others free.
 
     From those with the others fixed; the right sides are the others' overlaps
     with it and their gradient.
     """
-    _, a, right, sums = scratch
     g, info = sums[0], sums[1]
     for c in range(size):
         u, v = right[c, 0], right[c, 1]
@@ -245,15 +241,21 @@ def _readjust(size, scratch):
 def _score_pixel(x, y, count, fit, template, weight, least, scratch):
     """Return significance and flux of a star at a pixel, or zeros."""
     members, a, right, sums = scratch
+    left, bottom, width, offset, derivatives = fit.stamps
+    flux = fit.sources.flux
     for m in range(count):
         star = members[m]
-        _template_overlap(x, y, template, weight, star,
-                          fit.sources.flux[star], fit.stamps, right[3 * m:])
-    _gather(count, fit, scratch)
+        _template_overlap(x, y, template, weight, left[star], bottom[star],
+                          width[star], offset[star], derivatives,
+                          right[3 * m:])
+        right[3 * m + 1, 0] *= flux[star]
+        right[3 * m + 2, 0] *= flux[star]
+    _gather(count, members, fit.equations, fit.pairs.indptr,
+            fit.pairs.neighbour, a, right)
     _scale(a, right, 3 * count)
     if not _cholesky(a, 3 * count):
         return 0.0, 0.0
-    info, g = _readjust(3 * count, scratch)
+    info, g = _readjust(3 * count, a, right, sums)
     if info < least * sums[1]:
         return 0.0, 0.0
     return g / sqrt(info + sums[2]), g / info
