@@ -95,7 +95,7 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     Raises
     ------
     TypeError, ValueError
-        If an argument is not valid.
+        If an argument is not valid, or if more stars are given than fit.
 
     Examples
     --------

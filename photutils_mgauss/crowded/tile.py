@@ -69,13 +69,9 @@ class TileJob:
 
 class Tile:
     """
-    The model of a tile with its equations, and what a search has to know.
+    The model of a `TileJob`, its equations, and what a search has to know.
 
-    Only the methods here change its attributes.
-
-    Parameters
-    ----------
-    job : TileJob
+    Nothing else writes into it.
 
     Attributes
     ----------
