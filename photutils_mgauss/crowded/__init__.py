@@ -3,17 +3,18 @@ All stars of a crowded image together, with its background.
 
 `photometry` has `CrowdedMixturePhotometry`; `plan` cuts the image into tiles,
 `solve` takes one tile from first search to last fit: `search` finds stars on
-the residual, `tile` fits them with the mesh of `background`, `bright` treats
-saturated stars, `given` a list of the user's, `stars` keeps who is beside
-whom, and `table` says what is reported of each. `injection` has
-`inject_and_recover`, artificial stars for completeness and errors. Changing
-where tiles are cut must not change a star: tests hold that.
+the residual, `bright` treats saturated stars, `given` a list of the user's.
+A `tile` is a `model`, stars on the mesh of `background`, and the `equations`
+of its joint fit. `stars` has the one form that stars have from list or search
+to the table, and who is beside whom; `table` says what is reported of each.
+`injection` has `inject_and_recover`, artificial stars for completeness and
+errors. Changing where tiles are cut must not change a star: tests hold that.
 """
 from photutils_mgauss.utils.lazy import hand_on
 
 __getattr__, __dir__, __all__ = hand_on(__name__, {
     'CrowdedMixturePhotometry': 'photometry',
-    'inject_and_recover': 'photometry',
-    'InjectionResult': 'photometry',
+    'inject_and_recover': 'injection',
+    'InjectionResult': 'injection',
     'UnfinishedTilesError': 'photometry',
 })

@@ -8,34 +8,31 @@ from photutils_mgauss.crowded.stars import Stars
 _SATURATED_PIXELS = (2, 2000)
 
 
-def seed_saturated(tile):
-    """Put a star on each clump of bad pixels that has a star's wings."""
-    clumps, n = label(~tile.good)
+def saturated_stars(model):
+    """Return a star for each clump of bad pixels that has a star's wings."""
+    clumps, n = label(~model.good)
     size = np.bincount(clumps.ravel(), minlength=n + 1)[1:]
     low, high = _SATURATED_PIXELS
-    data = tile.data - tile.background()
-    found = [_wing_star(tile, data, box, clumps[box] == k + 1)
+    data = model.data - model.background()
+    found = [_wing_star(model, data, box, clumps[box] == k + 1)
              for k, box in enumerate(find_objects(clumps))
              if low <= size[k] <= high]
     found = [star for star in found if star is not None]
-    if found:
-        x, y, flux, significance = np.array(found).T
-        tile.stars.append(Stars(x, y, flux, significance=significance,
-                                seeded=True, n_rows=tile.psf.n_rows))
+    return Stars.joined([Stars([], [], []), *found])
 
 
-def _wing_star(tile, data, box, clump):
+def _wing_star(model, data, box, clump):
     y, x = np.nonzero(clump)
     y, x = y + box[0].start, x + box[1].start
     column, row = round(x.mean()), round(y.mean())
     half = int(max(np.ptp(x), np.ptp(y)) / 2) + 6
-    ny, nx = tile.data.shape
+    ny, nx = model.data.shape
     part = (slice(max(0, row - half), min(ny, row + half + 1)),
             slice(max(0, column - half), min(nx, column + half + 1)))
-    stamp = tile.psf.stamp(column, row, half)[
+    stamp = model.psf.stamp(column, row, half)[
         part[0].start - row + half:part[0].stop - row + half,
         part[1].start - column + half:part[1].stop - column + half]
-    w = tile.weight[part]
+    w = model.weight[part]
     info = (w * stamp**2).sum()
     if info == 0:
         return None
@@ -47,12 +44,13 @@ def _wing_star(tile, data, box, clump):
     ratio = data[part][seen] / stamp[seen]
     flux = np.median(ratio)
     significance = flux * np.sqrt(info)
-    if significance < 10 * tile.options.threshold:
+    if significance < 10 * model.options.threshold:
         return None
-    return x.mean(), y.mean(), flux, significance
+    return Stars([x.mean()], [y.mean()], [flux], significance=significance,
+                 seeded=True)
 
 
-def size_differences(tile):
+def size_differences(model):
     """
     Return by how much the PSF's variance is too small at bright stars.
 
@@ -60,19 +58,20 @@ def size_differences(tile):
     is convolved with; its amplitude in the residual is fitted, with star and
     Laplacian together: a star that is too wide is too bright, too.
     """
-    s, out = tile.stars, []
+    s, stamps, out = model.stars, model.stamps, []
     bright = np.flatnonzero(
-        (s.flux * tile.profile[0] > 50 * tile.noise) & ~s.seeded)
-    ny, nx = tile.data.shape
+        (s.flux * model.psf.profile[0] > 50 * model.noise) & ~s.seeded)
+    ny, nx = model.data.shape
     for i in bright[np.argsort(-s.flux[bright])][:200]:
-        w, y, x = tile.width[i], tile.bottom[i], tile.left[i]
+        w, y, x = stamps.width[i], stamps.bottom[i], stamps.left[i]
         if x < 0 or y < 0 or x + w > nx or y + w > ny:
             continue
         window = slice(y, y + w), slice(x, x + w)
-        stamp = tile.jets[0, tile.offset[i]:tile.offset[i] + w * w]
+        first = stamps.offset[i]
+        stamp = stamps.derivatives[0, first:first + w * w]
         out.append(_size_difference(stamp.reshape(w, w), s.flux[i],
-                                    tile.weight[window],
-                                    tile.residual[window]))
+                                    model.weight[window],
+                                    model.residual[window]))
     return np.array([value for value in out if np.isfinite(value)])
 
 

@@ -8,11 +8,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from photutils_mgauss.crowded.search import leave_out
-from photutils_mgauss.crowded.stars import Stars
 
-# A star further from its entry has to be this much brighter to be meant: a
+# A star further from its entry has to be this much brighter to be the one: a
 # factor of exp(d^2 / 2) at d times this distance [pix].
-_MEANT = 0.3
+_ENTRY_DISTANCE = 0.3
 # Entries with less distance to another's star than this fraction of the
 # root of the PSF's area cannot be told from it.
 _SAME = 0.25
@@ -20,42 +19,35 @@ _SAME = 0.25
 _WARM_UP = (1.0, 0.3, 0.1, 0.03)
 
 
-def warm_up(tile, given):
-    """Start with the given stars alone, perhaps without fluxes."""
-    x, y, flux, number = given
-    s = Stars(x, y, flux, number=number.astype(int),
-              bound=tile.options.xy_bounds, n_rows=tile.psf.n_rows)
-    ny, nx = tile.data.shape
-    unknown = ~(s.flux > 0)
-    x = np.clip(np.rint(s.x), 0, nx - 1).astype(int)
-    y = np.clip(np.rint(s.y), 0, ny - 1).astype(int)
-    peak = np.maximum(tile.data[y, x] - tile.level.min(), tile.noise)
-    s.flux = np.where(unknown, peak / tile.profile[0], s.flux)
-    tile.stars = s
-    tile.refresh()
+def warm_up(tile, listed):
+    """Start with the stars of a list alone, perhaps without fluxes."""
+    model = tile.model
+    ny, nx = model.data.shape
+    x = np.clip(np.rint(listed.x), 0, nx - 1).astype(int)
+    y = np.clip(np.rint(listed.y), 0, ny - 1).astype(int)
+    peak = np.maximum(model.data[y, x] - model.level.min(), model.noise)
+    tile.start(listed.replaced(flux=np.where(
+        listed.flux > 0, listed.flux, peak / model.psf.profile[0])))
     for damping in _WARM_UP:
         tile.step(damping)
 
 
-def take_up(tile, given):
-    """Tell which stars of a tile are meant by a list; add what it lacks."""
-    x, y, _, number = given
-    places, number = np.column_stack([x, y]), number.astype(int)
+def associate(tile, listed):
+    """Give stars of a tile to the entries of a list; add what it lacks."""
+    same = _SAME * np.sqrt(tile.model.psf.area)
     bound = tile.options.xy_bounds
-    same = _SAME * np.sqrt(tile.area)
-    # Without bounds, whatever is near enough to be seen as one is meant.
+    # Without bounds, whatever is near enough to be seen as one will do.
     radius = max(same, bound) if np.isfinite(bound) else 4 * same
-    entry, star = meant(places, tile.stars, radius)
-    _name(tile, star, number[entry], places[entry])
-    left = np.setdiff1d(np.arange(number.size), entry)
-    left = _tell_repeats(tile, places, number, left, same)
-    _add(tile, places[left], number[left])
-    tile.step(0.05, _beside_added(tile))
+    entry, star = pair_up(listed, tile.model.stars, radius)
+    tile.bind(star, listed.chosen(entry))
+    left = np.setdiff1d(np.arange(len(listed)), entry)
+    _add(tile, _without_repeats(tile, listed.chosen(left), same))
+    tile.step(0.05, _beside_added(tile.model))
     leave_out(tile, tile.options.keep)
-    tile.step(0.05, _beside_added(tile))
+    tile.step(0.05, _beside_added(tile.model))
 
 
-def meant(places, stars, radius):
+def pair_up(entries, stars, radius):
     """
     Match entries and stars one to one, the nearest and brightest first.
 
@@ -63,80 +55,64 @@ def meant(places, stars, radius):
     -------
     entry, star : (n,) `~numpy.ndarray` of int
     """
-    if not len(places) or not len(stars):
+    if not len(entries) or not len(stars):
         return np.empty(0, int), np.empty(0, int)
-    close = cKDTree(places).sparse_distance_matrix(
-        cKDTree(np.column_stack([stars.x, stars.y])), radius,
-        output_type='coo_matrix')
-    cost = ((close.data / _MEANT)**2
+    close = _tree(entries).sparse_distance_matrix(
+        _tree(stars), radius, output_type='coo_matrix')
+    cost = ((close.data / _ENTRY_DISTANCE)**2
             - 2 * np.log(np.maximum(stars.flux[close.col], 1e-300)))
-    pairs, entries, taken = [], set(), set()
+    pairs, used, taken = [], set(), set()
     for k in np.lexsort((close.col, close.row, cost)):
         i, j = int(close.row[k]), int(close.col[k])
-        if i not in entries and j not in taken:
-            entries.add(i)
+        if i not in used and j not in taken:
+            used.add(i)
             taken.add(j)
             pairs.append((i, j))
     return tuple(np.array(pairs, int).reshape(-1, 2).T)
 
 
-def _name(tile, star, number, places):
-    """Give stars the numbers and places of their entries."""
-    s, bound = tile.stars, tile.options.xy_bounds
-    s.number[star], s.bound[star] = number, bound
-    s.x_init[star], s.y_init[star] = places.T
-    s.x[star] = s.x_init[star] + np.clip(
-        s.x[star] - s.x_init[star], -bound, bound)
-    s.y[star] = s.y_init[star] + np.clip(
-        s.y[star] - s.y_init[star], -bound, bound)
-    tile.refresh()
+def _tree(stars):
+    return cKDTree(np.column_stack([stars.x, stars.y]))
 
 
-def _tell_repeats(tile, places, number, left, same):
+def _without_repeats(tile, entries, same):
     """Note which entries mean the star of another; return the others."""
-    s = tile.stars
-    named = np.flatnonzero(s.listed)
-    if named.size and left.size:
-        gap, at = cKDTree(np.column_stack([s.x, s.y])[named]).query(
-            places[left])
+    named = tile.model.stars.chosen(tile.model.stars.listed)
+    if len(named) and len(entries):
+        gap, at = _tree(named).query(np.column_stack([entries.x, entries.y]))
         near = gap < same
-        _note(tile, places, number, left[near], s.number[named[at[near]]])
-        left = left[~near]
-    if left.size == 0:
-        return left
-    keep = np.ones(left.size, bool)
-    for first, second in sorted(cKDTree(places[left]).query_pairs(same)):
+        tile.note_repeats(entries.chosen(near), named.number[at[near]])
+        entries = entries.chosen(~near)
+    if not len(entries):
+        return entries
+    keep = np.ones(len(entries), bool)
+    for first, second in sorted(_tree(entries).query_pairs(same)):
         if keep[first] and keep[second]:
             keep[second] = False
-            _note(tile, places, number, left[[second]], number[left[[first]]])
-    return left[keep]
+            tile.note_repeats(entries.chosen([second]),
+                              entries.number[[first]])
+    return entries.chosen(keep)
 
 
-def _note(tile, places, number, entry, host):
-    tile.repeats += zip(number[entry], host, *places[entry].T, strict=True)
-
-
-def _beside_added(tile):
+def _beside_added(model):
     """Tell which stars are entries without a star, or near one of them."""
     # All others are what they are without a list.
-    added = tile.stars.hold > 0
+    added, near = model.stars.hold > 0, model.neighbours
     beside = added.copy()
-    beside[tile.pairs.owner[added[tile.pairs.neighbour]]] = True
+    beside[near.owner[added[near.neighbour]]] = True
     return beside
 
 
-def _add(tile, places, number):
+def _add(tile, entries):
     """Add entries without a star, as bright as the residual allows."""
-    n = len(tile.stars)
-    least = 0.1 * tile.noise / tile.profile[0]
+    model = tile.model
+    n = len(model.stars)
+    least = np.full(len(entries), 0.1 * model.noise / model.psf.profile[0])
     # What is hardly seen is taken to be where the list says it is.
     spread = min(tile.options.xy_bounds, 1.0) / 2
-    tile.admit(Stars(*places.T, np.full(len(places), least), number=number,
-                     bound=tile.options.xy_bounds, hold=spread**-2,
-                     n_rows=tile.psf.n_rows))
-    s, information = tile.stars, tile.matrix[n:, 0, 0]
-    more = np.divide(tile.gradient[n:, 0], information,
-                     where=information > 0, out=np.zeros(len(places)))
-    s.flux[n:] += np.maximum(more, 0)
-    s.flux_init[n:] = s.flux[n:]
-    tile.refresh()
+    tile.admit(entries.replaced(flux=least, flux_init=least.copy(),
+                                hold=np.full(len(entries), spread**-2)))
+    information = tile.equations.stars.matrix[n:, 0, 0]
+    more = np.divide(tile.equations.stars.gradient[n:, 0], information,
+                     where=information > 0, out=np.zeros(len(entries)))
+    tile.brighten(np.s_[n:], np.maximum(more, 0))

@@ -3,10 +3,19 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, vstack
 from scipy.spatial import cKDTree
 
+from photutils_mgauss.crowded.table import positions
+from photutils_mgauss.psf.renderer import MixtureRenderer
+from photutils_mgauss.utils.image import read_pixels, read_values, with_unit
 from photutils_mgauss.utils.robust import std_about_zero
+from photutils_mgauss.utils.star_columns import column_values
+from photutils_mgauss.utils.validation import as_floats, as_integer, as_real
+
+# Artificial stars are drawn out to where this fraction of the smallest noise
+# is left of them.
+_FAINTEST = 1e-3
 
 
 @dataclass(frozen=True)
@@ -30,6 +39,70 @@ class InjectionResult:
 
     Examples
     --------
+    >>> from astropy.table import QTable
+    >>> from photutils_mgauss import InjectionResult
+    >>> stars = QTable({'flux_true': [2e3, 9e3], 'recovered': [False, True]})
+    >>> result = InjectionResult(stars, curves=QTable())
+    >>> float(result.stars['flux_true'][~result.stars['recovered']][0])
+    2000.0
+    """
+
+    stars: QTable
+    curves: QTable
+
+
+def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
+                       separation=20, radius=0.7, flux_ratio=2.5,
+                       flux_edges=None, effective_gain=1.0, repeats=1,
+                       rng=None):
+    """
+    Add artificial stars to an image and see what is found of them.
+
+    The stars are drawn with the PSF of ``photometry``, with the noise of
+    their own light, on a jittered lattice so wide that they do not crowd one
+    another, and the image is reduced again as before.
+
+    Parameters
+    ----------
+    photometry : CrowdedMixturePhotometry
+        How the image is reduced.
+    data : (ny, nx) array_like or NDData
+        The image. Its own mask counts, its unit comes back: see
+        :ref:`pixels`.
+    flux : (n,) array_like or (low, high) tuple of float
+        The fluxes of the stars of one repeat, or limits between which they
+        are drawn evenly in the logarithm, as many as there is room for.
+    mask, error
+        As in `CrowdedMixturePhotometry.__call__`.
+    separation : float, optional
+        The distance of artificial stars [pix].
+    radius : float, optional
+        How far from its place a star may be found [pix].
+    flux_ratio : float, optional
+        By which factor its flux may be off.
+    flux_edges : (m + 1,) array_like, optional
+        The edges of the bins of flux; by default about a magnitude wide.
+    effective_gain : float, optional
+        Electrons per unit of data, for the noise of the artificial stars.
+    repeats : int, optional
+        How often to do it.
+    rng : `~numpy.random.Generator` or int, optional
+        Randomness, or a seed.
+
+    Returns
+    -------
+    InjectionResult
+        With the tables ``stars`` and ``curves``.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not valid, or if more stars are given than fit.
+
+    Examples
+    --------
+    Stars on a dark sky are all found:
+
     >>> import numpy as np
     >>> from photutils_mgauss import (CrowdedMixturePhotometry,
     ...                               GaussianMixture, GriddedMixturePSF,
@@ -40,15 +113,40 @@ class InjectionResult:
     >>> data = np.random.default_rng(1).normal(100, 10, (60, 60))
     >>> result = inject_and_recover(phot, data, (3000, 9000), rng=2,
     ...                             error=np.full((60, 60), 10.0))
-    >>> result.curves.colnames[:4]
-    ['flux_min', 'flux_max', 'n_injected', 'completeness']
-    >>> lost = result.stars[~result.stars['recovered']]
-    >>> len(lost)
-    0
+    >>> result.curves['completeness']
+    <Column name='completeness' dtype='float64' length=1>
+    1.0
     """
-
-    stars: QTable
-    curves: QTable
+    rng = np.random.default_rng(rng)
+    pixels = read_pixels(data, error, mask).with_error()
+    image, variance = pixels.part()
+    flux = _true_fluxes(flux, pixels.unit)
+    gain = as_real(effective_gain, 'effective_gain', above=0)
+    repeats = as_integer(repeats, 'repeats', minimum=1)
+    separation = as_real(separation, 'separation', minimum=5)
+    before = photometry(data, mask=mask, error=error)
+    known = positions(before)
+    renderer = MixtureRenderer(photometry.psf_model)
+    faintest = _FAINTEST * np.sqrt(variance[variance > 0].min(initial=np.inf))
+    tables = []
+    for _ in range(repeats):
+        true = _artificial(variance, flux, separation, rng)
+        light = renderer.image(np.array(true), faintest, image.shape)
+        noisy = rng.poisson(np.maximum(light, 0) * gain) / gain
+        table = photometry(image + noisy, mask=variance == 0,
+                           error=np.sqrt(variance + light / gain))
+        row = match(true, positions(table), known, radius, flux_ratio)
+        tables.append(_injected(true, table, row))
+    photometry.results = before
+    stars = vstack(tables)
+    if flux_edges is None:
+        flux_edges = _flux_edges(np.asarray(stars['flux_true']))
+    else:
+        flux_edges = read_values(flux_edges, 'flux_edges', pixels.unit)
+    result = InjectionResult(stars, curves(stars, flux_edges))
+    _with_units(stars, ('flux_true', 'flux_fit', 'flux_err'), pixels.unit)
+    _with_units(result.curves, ('flux_min', 'flux_max'), pixels.unit)
+    return result
 
 
 def place_stars(shape, mask, n, separation, rng):
@@ -135,3 +233,52 @@ def _scatter(values):
     """Return the standard deviation about zero, from the median size."""
     values = values[np.isfinite(values)]
     return float(std_about_zero(values)) if values.size else np.nan
+
+
+def _true_fluxes(flux, unit):
+    """Return the fluxes of artificial stars, or a tuple of limits."""
+    values = np.atleast_1d(as_floats(read_values(flux, 'flux', unit),
+                                     'flux'))
+    if not (values > 0).all():
+        msg = f'flux must be positive, got {values.min()}'
+        raise ValueError(msg)
+    return tuple(values) if isinstance(flux, tuple) else values
+
+
+def _with_units(table, names, unit):
+    for name in names:
+        table[name] = with_unit(table[name], unit)
+
+
+def _artificial(variance, flux, separation, rng):
+    """Draw x, y and flux of the artificial stars of one repeat."""
+    limits = isinstance(flux, tuple)
+    flux = np.asarray(flux)
+    n = variance.size if limits else flux.size
+    x, y = place_stars(variance.shape, variance == 0, n, separation, rng)
+    if limits:
+        flux = np.exp(rng.uniform(*np.log(flux), x.size))
+    elif x.size < flux.size:
+        msg = (f'flux must not hold more stars than fit {separation} pixels '
+               f'apart, {x.size}, got {flux.size}')
+        raise ValueError(msg)
+    return x, y, flux
+
+
+def _injected(true, table, row):
+    out = QTable(dict(zip(('x_true', 'y_true', 'flux_true'), true,
+                          strict=True)))
+    found = row >= 0
+    out['recovered'] = found
+    for name in ('x_fit', 'y_fit', 'flux_fit', 'x_err', 'y_err', 'flux_err'):
+        column = np.full(row.size, np.nan)
+        column[found] = column_values(table, name)[row[found]]
+        out[name] = column
+    out['flags'] = np.zeros(row.size, int)
+    out['flags'][found] = np.asarray(table['flags'])[row[found]]
+    return out
+
+
+def _flux_edges(flux):
+    n = max(1, round(2.5 * np.log10(flux.max() / flux.min())))
+    return np.geomspace(flux.min(), flux.max() * (1 + 1e-9), n + 1)

@@ -8,30 +8,31 @@ Galactic bulge.
 import warnings
 
 import numpy as np
-from astropy.table import QTable, vstack
 from astropy.utils.exceptions import AstropyUserWarning
 
-from photutils_mgauss import kernels
-from photutils_mgauss.crowded import injection
-from photutils_mgauss.crowded.injection import InjectionResult
 from photutils_mgauss.crowded.plan import Plan, run
-from photutils_mgauss.crowded.table import REPEATED, StarTable, as_qtable
+from photutils_mgauss.crowded.stars import Stars
+from photutils_mgauss.crowded.table import (
+    NO_COVARIANCE,
+    NO_OVERLAP,
+    REPEATED,
+    as_qtable,
+    no_stars,
+    positions,
+)
 from photutils_mgauss.crowded.tile import TileOptions
 from photutils_mgauss.psf.local import LocalPSF
-from photutils_mgauss.utils.image import read_pixels, read_values, with_unit
+from photutils_mgauss.psf.renderer import MixtureRenderer
+from photutils_mgauss.utils.image import read_pixels, with_unit
 from photutils_mgauss.utils.star_columns import column_values, read_sources
-from photutils_mgauss.utils.validation import (
-    as_floats,
-    as_integer,
-    as_real,
-    as_shape,
-)
+from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
-__all__ = ['CrowdedMixturePhotometry', 'InjectionResult',
-           'UnfinishedTilesError', 'inject_and_recover']
+__all__ = ['CrowdedMixturePhotometry', 'UnfinishedTilesError']
 
 # A PSF whose size is off by more than this fraction is warned of.
 _WIDTH_TOLERANCE = 0.1
+# Stars are drawn out to where this fraction of the noise is left of them.
+_FAINTEST = 1e-3
 
 
 class UnfinishedTilesError(RuntimeError):
@@ -222,7 +223,9 @@ class CrowdedMixturePhotometry:
         if xy_bounds is not None:
             self.xy_bounds = as_real(xy_bounds, 'xy_bounds', above=0)
         self.results = None
-        self._psf = _local_psf(psf_model)
+        # That of a pixel of the last image.
+        self._noise = np.inf
+        self._psf = LocalPSF.of(psf_model)
 
     def __call__(self, data, *, mask=None, error=None, init_params=None):
         """
@@ -259,9 +262,11 @@ class CrowdedMixturePhotometry:
         """
         image = read_pixels(data, error, mask).with_error()
         given = (None if init_params is None
-                 else _given(init_params, image.unit))
-        plan = Plan(image, self._psf, self._options(image), self.tile_shape,
-                    self.overlap, given)
+                 else self._listed(init_params, image.unit))
+        options = self._options(image)
+        self._noise = options.noise
+        plan = Plan(image, self._psf, options, self.tile_shape, self.overlap,
+                    given)
         outcomes, errors = run(plan, self.executor, self.progress_bar)
         unfinished = [core for core, outcome in zip(plan.cores, outcomes,
                                                     strict=True)
@@ -270,6 +275,14 @@ class CrowdedMixturePhotometry:
         if unfinished:
             raise UnfinishedTilesError(unfinished, self.results) from errors[0]
         return self.results
+
+    def _listed(self, init_params, unit):
+        x, y, flux, number = _given(init_params, unit)
+        return Stars(x, y, flux, number=number, bound=self._bound)
+
+    @property
+    def _bound(self):
+        return np.inf if self.xy_bounds is None else self.xy_bounds
 
     def _options(self, image):
         _, variance = image.sample()
@@ -285,20 +298,21 @@ class CrowdedMixturePhotometry:
             floor=float(variance.min()),
             noise=float(np.sqrt(np.median(variance))),
             max_rounds=self.maxiters, find_neighbors=self.find_neighbors,
-            xy_bounds=np.inf if self.xy_bounds is None else self.xy_bounds,
+            xy_bounds=self._bound,
             depth=self.depth, count_slope=self.count_slope)
 
     def _table(self, outcomes, given, unit):
         """Put the stars of the tiles together; empties the list."""
         done = [outcome for outcome in outcomes if outcome is not None]
         outcomes.clear()
-        stars = StarTable.joined([outcome.stars for outcome in done])
+        stars = Stars.joined([no_stars(),
+                              *(outcome.stars for outcome in done)])
         meta = self._report(done, stars)
         del done
         if given is not None:
             stars = _in_given_order(stars, given)
         else:
-            stars.sort('y_fit', 'x_fit')
+            stars.sort('y', 'x')
         return as_qtable(stars, unit, meta)
 
     def _report(self, done, stars):
@@ -345,10 +359,12 @@ class CrowdedMixturePhotometry:
             raise ValueError(msg)
         shape = as_shape(shape, 'shape')
         table = self.results
-        flux = column_values(table, 'flux_fit')
-        flux = np.where(table['flags'] & REPEATED, 0, flux)
-        image = _draw(self._psf, table['x_fit'], table['y_fit'], flux, shape,
-                      psf_shape)
+        stars = np.array(positions(table))
+        stars[2, (table['flags'] & REPEATED) > 0] = 0
+        window = None if psf_shape is None else as_shape(psf_shape,
+                                                         'psf_shape')
+        image = MixtureRenderer(self.psf_model).image(
+            stars, _FAINTEST * self._noise, shape, window)
         if include_local_bkg and len(table):
             image += _nearest_background(table, shape)
         return with_unit(image, getattr(table['flux_fit'], 'unit', None))
@@ -375,23 +391,6 @@ class CrowdedMixturePhotometry:
             include_local_bkg=include_local_bkg)
 
 
-def _local_psf(model):
-    grid = getattr(model, '_grid', None)
-    if grid is not None:
-        return LocalPSF.from_nodes(
-            grid.x_grid, grid.y_grid, grid.weights * grid.scales[:, None],
-            grid.means, grid.covariances, model.pixel_integrated)
-    mixture = getattr(model, 'mixture', None)
-    if mixture is None:
-        msg = ('psf_model must be a GriddedMixturePSF or a '
-               f'MultiGaussianPSFModel, got {model!r:.80}')
-        raise TypeError(msg)
-    return LocalPSF.from_nodes(
-        np.zeros(1), np.zeros(1), mixture.weights[None],
-        mixture.means[None], mixture.covariances[None],
-        bool(model.pixel_integrated))
-
-
 def _given(table, unit):
     """Return x, y, flux (NaN if unknown) and the row of each position."""
     found = read_sources(table, 'init_params', first='_init', unit=unit)
@@ -400,39 +399,18 @@ def _given(table, unit):
 
 def _in_given_order(stars, given):
     """Return one row for each position; NaN where nothing was fitted."""
-    x, y, flux, _ = given
-    n = x.size
+    n = len(given)
     columns = {}
-    for name, column in stars.columns.items():
+    for name, column in vars(stars).items():
         fill = np.nan if column.dtype.kind == 'f' else 0
         columns[name] = np.full(n, fill, column.dtype)
-        columns[name][stars.columns['number']] = column
+        columns[name][stars.number] = column
     missing = np.ones(n, bool)
-    missing[stars.columns['number']] = False
-    columns['flags'][missing] |= 16 | 64
-    columns['x_init'], columns['y_init'] = x, y
-    known = np.isfinite(flux)
-    columns['flux_init'] = np.where(known, flux, columns['flux_init'])
-    return StarTable(columns)
-
-
-def _draw(psf, x, y, flux, shape, psf_shape):
-    x, y = np.asarray(x, float), np.asarray(y, float)
-    good = np.isfinite(x) & np.isfinite(y) & np.isfinite(flux)
-    x, y, flux = x[good], y[good], flux[good]
-    image = np.zeros(shape)
-    if psf_shape is None:
-        wing = np.full(x.size, 30)
-    else:
-        wing = np.full(x.size, max(as_shape(psf_shape, 'psf_shape')) // 2)
-    one = np.ones(x.size, np.int64)
-    rows, count = psf.rows_at(x, y)
-    left, bottom = (np.rint(v).astype(np.int64) for v in (x, y))
-    faintest = 1e-7 * max(np.abs(flux).max(initial=0), 1e-300)
-    kernels.add_stars(np.arange(x.size), 1.0, x, y, flux, left, bottom, one,
-                      0 * one, wing.astype(np.int64), np.empty((3, 1)),
-                      rows, count, psf.integrated, faintest, image)
-    return image
+    missing[stars.number] = False
+    columns['flags'][missing] |= NO_COVARIANCE | NO_OVERLAP
+    columns['flux_init'] = np.where(np.isfinite(given.flux), given.flux,
+                                    columns['flux_init'])
+    return Stars.of_columns(columns).replaced(x_init=given.x, y_init=given.y)
 
 
 def _nearest_background(table, shape):
@@ -444,150 +422,3 @@ def _nearest_background(table, shape):
     y, x = np.indices(shape)
     nearest = tree.query(np.column_stack([x.ravel(), y.ravel()]))[1]
     return level[good][nearest].reshape(shape)
-
-
-def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
-                       separation=20, radius=0.7, flux_ratio=2.5,
-                       flux_edges=None, effective_gain=1.0, repeats=1,
-                       rng=None):
-    """
-    Add artificial stars to an image and see what is found of them.
-
-    The stars are drawn with the PSF of ``photometry``, with the noise of
-    their own light, on a jittered lattice so wide that they do not crowd one
-    another, and the image is reduced again as before.
-
-    Parameters
-    ----------
-    photometry : CrowdedMixturePhotometry
-        How the image is reduced.
-    data : (ny, nx) array_like or NDData
-        The image. Its own mask counts, its unit comes back: see
-        :ref:`pixels`.
-    flux : (n,) array_like or (low, high) tuple of float
-        The fluxes of the stars of one repeat, or limits between which they
-        are drawn evenly in the logarithm, as many as there is room for.
-    mask, error
-        As in `CrowdedMixturePhotometry.__call__`.
-    separation : float, optional
-        The distance of artificial stars [pix].
-    radius : float, optional
-        How far from its place a star may be found [pix].
-    flux_ratio : float, optional
-        By which factor its flux may be off.
-    flux_edges : (m + 1,) array_like, optional
-        The edges of the bins of flux; by default about a magnitude wide.
-    effective_gain : float, optional
-        Electrons per unit of data, for the noise of the artificial stars.
-    repeats : int, optional
-        How often to do it.
-    rng : `~numpy.random.Generator` or int, optional
-        Randomness, or a seed.
-
-    Returns
-    -------
-    InjectionResult
-        With the tables ``stars`` and ``curves``.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is not valid.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from photutils_mgauss import (CrowdedMixturePhotometry,
-    ...                               GaussianMixture, GriddedMixturePSF,
-    ...                               inject_and_recover)
-    >>> mixture = GaussianMixture([1], [[0, 0]], [[[0.7, 0], [0, 0.8]]])
-    >>> phot = CrowdedMixturePhotometry(GriddedMixturePSF([mixture],
-    ...                                                   [(0, 0)]))
-    >>> data = np.random.default_rng(1).normal(100, 10, (60, 60))
-    >>> result = inject_and_recover(phot, data, (3000, 9000), rng=2,
-    ...                             error=np.full((60, 60), 10.0))
-    >>> result.curves['completeness']
-    <Column name='completeness' dtype='float64' length=1>
-    1.0
-    """
-    rng = np.random.default_rng(rng)
-    pixels = read_pixels(data, error, mask).with_error()
-    image, variance = pixels.part()
-    flux = _true_fluxes(flux, pixels.unit)
-    gain = as_real(effective_gain, 'effective_gain', above=0)
-    repeats = as_integer(repeats, 'repeats', minimum=1)
-    separation = as_real(separation, 'separation', minimum=5)
-    before = photometry(data, mask=mask, error=error)
-    known = _positions(before)
-    tables = []
-    for _ in range(repeats):
-        true = _artificial(variance, flux, separation, rng)
-        light = _draw(photometry._psf, *true, image.shape, None)
-        noisy = rng.poisson(np.maximum(light, 0) * gain) / gain
-        table = photometry(image + noisy, mask=variance == 0,
-                           error=np.sqrt(variance + light / gain))
-        row = injection.match(true, _positions(table), known, radius,
-                              flux_ratio)
-        tables.append(_injected(true, table, row))
-    photometry.results = before
-    stars = vstack(tables)
-    if flux_edges is None:
-        flux_edges = _flux_edges(np.asarray(stars['flux_true']))
-    else:
-        flux_edges = read_values(flux_edges, 'flux_edges', pixels.unit)
-    curves = injection.curves(stars, flux_edges)
-    for table, names in ((stars, ('flux_true', 'flux_fit', 'flux_err')),
-                         (curves, ('flux_min', 'flux_max'))):
-        for name in names:
-            table[name] = with_unit(table[name], pixels.unit)
-    return InjectionResult(stars, curves)
-
-
-def _true_fluxes(flux, unit):
-    """Return the fluxes of artificial stars, or a tuple of limits."""
-    values = np.atleast_1d(as_floats(read_values(flux, 'flux', unit),
-                                     'flux'))
-    if not (values > 0).all():
-        msg = f'flux must be positive, got {values.min()}'
-        raise ValueError(msg)
-    return tuple(values) if isinstance(flux, tuple) else values
-
-
-def _artificial(variance, flux, separation, rng):
-    """Draw x, y and flux of the artificial stars of one repeat."""
-    limits = isinstance(flux, tuple)
-    flux = np.asarray(flux)
-    n = variance.size if limits else flux.size
-    x, y = injection.place_stars(variance.shape, variance == 0, n, separation,
-                                 rng)
-    if limits:
-        flux = np.exp(rng.uniform(*np.log(flux), x.size))
-    elif x.size < flux.size:
-        msg = (f'flux must not hold more stars than fit {separation} pixels '
-               f'apart, {x.size}, got {flux.size}')
-        raise ValueError(msg)
-    return x, y, flux
-
-
-def _positions(table):
-    return tuple(column_values(table, name)
-                 for name in ('x_fit', 'y_fit', 'flux_fit'))
-
-
-def _injected(true, table, row):
-    out = QTable(dict(zip(('x_true', 'y_true', 'flux_true'), true,
-                          strict=True)))
-    found = row >= 0
-    out['recovered'] = found
-    for name in ('x_fit', 'y_fit', 'flux_fit', 'x_err', 'y_err', 'flux_err'):
-        column = np.full(row.size, np.nan)
-        column[found] = column_values(table, name)[row[found]]
-        out[name] = column
-    out['flags'] = np.zeros(row.size, int)
-    out['flags'][found] = np.asarray(table['flags'])[row[found]]
-    return out
-
-
-def _flux_edges(flux):
-    n = max(1, round(2.5 * np.log10(flux.max() / flux.min())))
-    return np.geomspace(flux.min(), flux.max() * (1 + 1e-9), n + 1)

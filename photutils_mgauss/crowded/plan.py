@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from photutils_mgauss.crowded.solve import solve_tile
-from photutils_mgauss.crowded.table import StarTable, tabulate
+from photutils_mgauss.crowded.stars import Stars
+from photutils_mgauss.crowded.table import no_stars, tabulate
 from photutils_mgauss.crowded.tile import CELL, TileJob, TileOptions
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.image import PixelData
@@ -19,7 +20,7 @@ _TILES = (1024, 2048)
 class Outcome:
     """What comes back from a worker."""
 
-    stars: StarTable
+    stars: Stars
     chi2: float = 0.0
     n_pixels: int = 0
     widths: np.ndarray = field(default_factory=lambda: np.empty(0))
@@ -28,11 +29,12 @@ class Outcome:
     def of(cls, job):
         """Solve a tile."""
         if job.is_empty:
-            return cls(StarTable.empty())
+            return cls(no_stars())
         tile = solve_tile(job)
-        chi = tile.weight * tile.residual**2
+        model = tile.model
+        chi = model.weight * model.residual**2
         return cls(tabulate(tile, job.core), float(chi.sum()),
-                   int(tile.good.sum()), tile.widths)
+                   int(model.good.sum()), tile.widths)
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class Plan:
 
     ``tile_shape`` is the largest shape of a tile, None that of a size that
     does not need much memory and leaves work for more than one worker.
-    ``given`` is None, or x, y, flux and number of the stars of a list.
+    ``given`` is None, or the stars of a list.
     """
 
     image: PixelData
@@ -50,7 +52,7 @@ class Plan:
     options: TileOptions
     tile_shape: tuple | None
     overlap: int
-    given: tuple | None
+    given: Stars | None
 
     @property
     def cores(self):
@@ -69,11 +71,10 @@ class Plan:
         x_low, x_high = _window(core[2:], nx, self.overlap, margin)
         part = None
         if self.given is not None:
-            x, y, flux, number = self.given
+            x, y = self.given.x, self.given.y
             near = ((x > x_low - 1) & (x < x_high) & (y > y_low - 1)
                     & (y < y_high))
-            part = np.array([x[near] - x_low, y[near] - y_low, flux[near],
-                             number[near]])
+            part = self.given.chosen(near).moved(-x_low, -y_low)
         return TileJob(*self.image.part(np.s_[y_low:y_high, x_low:x_high]),
                        self.psf.moved(x_low, y_low), self.options,
                        (y_low, x_low), self._reported(core), part)

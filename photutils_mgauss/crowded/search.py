@@ -17,7 +17,7 @@ _REACH = 2.3
 _LEAST = 0.05
 # No star is added this close to another, or to one that was taken away [pix].
 _SEPARATION = 0.3
-_GRAVE = 0.5
+_REJECTED = 0.5
 # Within this distance [pix], stars are too many to be stars if each has less
 # than this many times the PSF's own area, in which half a star's information
 # lies.
@@ -36,63 +36,62 @@ def find(tile, threshold, found_in):
     y, x = np.nonzero(peak)
     dx, dy = _vertex(significance, x, y)
     found = Stars(x + dx, y + dy, flux[y, x],
-                  significance=significance[y, x], found_in=found_in,
-                  n_rows=tile.psf.n_rows)
-    found.select(_apart(tile, found))
-    tile.admit(found)
+                  significance=significance[y, x], found_in=found_in)
+    tile.admit(found.chosen(_apart(tile, found)))
 
 
 def _scores(tile, threshold):
-    ny, nx = tile.data.shape
+    model, templates = tile.model, tile.templates
+    ny, nx = model.data.shape
     significance = np.zeros((ny, nx))
     flux = np.zeros((ny, nx))
-    light = tile.options.psf_error * np.maximum(tile.star_light(), 0)
-    weight = np.divide(tile.weight, 1 + tile.weight * light**2)
-    for j, i in np.ndindex(tile.templates.shape[:2]):
+    light = tile.options.psf_error * np.maximum(model.star_light(), 0)
+    weight = np.divide(model.weight, 1 + model.weight * light**2)
+    for j, i in np.ndindex(templates.stamps.shape[:2]):
         kernels.score(
-            tile.residual, weight, tile.templates[j, i], i * CELL,
+            model.residual, weight, templates.stamps[j, i], i * CELL,
             min((i + 1) * CELL, nx), j * CELL, min((j + 1) * CELL, ny),
             _HINT * threshold, significance, flux)
-    s, p = tile.stars, tile.pairs
-    kernels.score_beside(
-        s.x, s.y, s.flux, *tile._place(), tile.jets, tile.matrix,
-        tile.gradient, p.indptr, p.neighbour, tile.blocks, tile.templates,
-        CELL, tile.weight, tile.residual, light, _REACH, _LEAST,
-        threshold, significance, flux)
+    fit = kernels.Fit(model.stars.sources, model.stamps,
+                      model.neighbours.pairs, tile.equations.stars)
+    kernels.score_beside(fit, templates, model.planes(light),
+                         kernels.Limits(_REACH, _LEAST, float(threshold)),
+                         significance, flux)
     return significance, flux
 
 
 def _apart(tile, found):
     apart = np.ones(len(found), bool)
     positions = np.column_stack([found.x, found.y])
-    stars = np.column_stack([tile.stars.x, tile.stars.y])
-    for places, limit in ((stars, _SEPARATION), (tile.graves, _GRAVE)):
+    known = tile.model.stars
+    stars = np.column_stack([known.x, known.y])
+    for places, limit in ((stars, _SEPARATION), (tile.rejected, _REJECTED)):
         if len(places) and len(found):
             apart &= cKDTree(places).query(positions)[0] > limit
-    return apart & ~too_dense(tile, found.x, found.y)
+    return apart & ~too_dense(tile.model, found.x, found.y)
 
 
-def too_dense(tile, x, y):
+def too_dense(model, x, y):
     """Tell at which positions there are more stars than can be."""
-    s = tile.stars
+    s = model.stars
     if not len(s) or not len(x):
         return np.zeros(len(x), bool)
     tree = cKDTree(np.column_stack([s.x, s.y]))
     count = tree.query_ball_point(np.column_stack([x, y]),
                                   _DENSITY_REACH, return_length=True)
     # The part of the circle that is on the tile.
-    ny, nx = tile.data.shape
+    ny, nx = model.data.shape
     part = [np.minimum(v + 0.5, _DENSITY_REACH)
             + np.minimum(n - 0.5 - v, _DENSITY_REACH)
             for v, n in ((x, nx), (y, ny))]
     space = np.pi / 4 * np.prod(np.maximum(part, 1), axis=0)
-    return (count * tile.area * _OWN_AREA > space) & (count > 5)
+    return (count * model.psf.area * _OWN_AREA > space) & (count > 5)
 
 
-def extended(tile):
+def extended(model):
     """Tell which stars are where, and beside where, there are too many."""
-    s = tile.stars
-    out = too_dense(tile, s.x, s.y)
+    s = model.stars
+    out = too_dense(model, s.x, s.y)
     if not out.any():
         return out
     first, second = cKDTree(np.column_stack([s.x, s.y])).query_pairs(
@@ -106,9 +105,13 @@ def extended(tile):
 
 
 def leave_out(tile, threshold):
-    """Remove the weakest of each clump of insignificant stars."""
-    s, p = tile.stars, tile.pairs
-    covariance, _ = tile.covariances()
+    """
+    Remove the weakest of each clump of insignificant stars.
+
+    Returns their places (n, 2).
+    """
+    s, p = tile.model.stars, tile.model.neighbours
+    covariance, _ = tile.equations.covariances()
     with np.errstate(invalid='ignore'):
         strength = s.flux / np.sqrt(covariance[:, 0, 0])
     weak = ~(strength >= threshold) & ~s.listed
@@ -117,7 +120,7 @@ def leave_out(tile, threshold):
     rival = (near & weak[p.neighbour]
              & (s.flux[p.neighbour] < s.flux[p.owner]))
     weak[p.owner[rival]] = False
-    ny, nx = tile.data.shape
+    ny, nx = tile.model.data.shape
     weak |= ~s.listed & ((s.x < -1) | (s.y < -1) | (s.x > nx)
                          | (s.y > ny))
     gone = np.flatnonzero(weak)

@@ -1,14 +1,13 @@
 """The stars of a tile found and fitted, from first to last."""
-import numpy as np
-
-from photutils_mgauss.crowded.bright import seed_saturated, size_differences
-from photutils_mgauss.crowded.given import take_up, warm_up
+from photutils_mgauss.crowded.bright import saturated_stars, size_differences
+from photutils_mgauss.crowded.given import associate, warm_up
 from photutils_mgauss.crowded.search import find, leave_out
-from photutils_mgauss.crowded.tile import REST, Tile
+from photutils_mgauss.crowded.tile import Tile
 
 # Finding starts with the brightest stars.
 _FALLING = (80, 25, 10)
 _FIRST_STEPS, _FINAL_STEPS = 3, 5
+_DAMPING = 0.02
 
 
 def solve_tile(job):
@@ -22,18 +21,16 @@ def solve_tile(job):
     Returns
     -------
     Tile
-        Solved, its equations those of the solution, with ``moved`` (n,), how
-        far each star went in the last step.
+        Solved, its equations those of the solution.
     """
     tile = Tile(job)
     if job.given is not None and not job.options.find_neighbors:
         warm_up(tile, job.given)
     else:
-        seed_saturated(tile)
-        tile.refresh()
+        tile.start(saturated_stars(tile.model))
         _find_all(tile)
         if job.given is not None:
-            take_up(tile, job.given)
+            associate(tile, job.given)
     _settle(tile)
     return tile
 
@@ -50,7 +47,7 @@ def _find_all(tile):
             if number == 0:
                 # Later, errors of the PSF are hidden by false companions.
                 tile.step(0.05)
-                tile.widths = size_differences(tile)
+                tile.note_widths(size_differences(tile.model))
             leave_out(tile, 1.0)
     for number in range(options.max_rounds):
         find(tile, options.faintest, len(_FALLING) + number)
@@ -59,23 +56,13 @@ def _find_all(tile):
             leave_out(tile, 0.7 * options.keep)
         else:
             tile.step(0.05)
-            gone = leave_out(tile, options.keep)
-            tile.graves = np.concatenate([tile.graves, gone])
+            tile.reject(leave_out(tile, options.keep))
 
 
 def _settle(tile):
-    _polish(tile, _FIRST_STEPS)
+    tile.polish(_DAMPING, _FIRST_STEPS)
     # Some have faded, or become one with another.
     leave_out(tile, tile.options.keep)
-    _polish(tile, _FINAL_STEPS)
+    tile.polish(_DAMPING, _FINAL_STEPS)
     # Some may have moved out of the middle of their stamps.
     tile.refresh()
-
-
-def _polish(tile, n_steps):
-    tile.start_polishing()
-    tile.moved = np.zeros(len(tile.stars))
-    for _ in range(n_steps):
-        tile.moved = tile.polish(0.02)
-        if not (tile.moved > REST).any():
-            break

@@ -1,4 +1,4 @@
-"""The stars of a tile of a crowded field, and who is beside whom."""
+"""The stars of a crowded field, and who is beside whom."""
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,29 +11,47 @@ _PAIR_DISTANCE = 5.0
 
 
 class Stars:
-    """The stars of a tile, as parallel arrays."""
+    """
+    Stars as parallel arrays, from a list or a search over fits to the table.
 
-    COLUMNS = ('x', 'y', 'flux', 'x_init', 'y_init', 'flux_init',
-               'significance', 'round', 'number', 'seeded', 'rows', 'paces',
-               'count', 'bound', 'hold')
+    Every attribute is a column. Positions are pixels of the tile or of the
+    image; ``number`` is the row of the user's list, -1 for stars found.
+    ``bound`` is how far from its first place a star may go [pix], ``hold``
+    the inverse variance with which it is held there.
+
+    Parameters
+    ----------
+    x, y, flux : (n,) array_like
+        Also what the stars start from, ``x_init`` to ``flux_init``.
+    significance, found_in, number, seeded, bound, hold : optional
+        Columns, or what all stars have in them.
+    """
 
     def __init__(self, x, y, flux, *, significance=0, found_in=0, number=-1,
-                 seeded=False, bound=np.inf, hold=0, n_rows=0):
+                 seeded=False, bound=np.inf, hold=0):
         n = len(x)
         self.x, self.y, self.flux = (np.array(v, float) for v in (x, y, flux))
         self.x_init, self.y_init = self.x.copy(), self.y.copy()
         self.flux_init = self.flux.copy()
         self.significance = np.zeros(n) + significance
-        self.round = np.zeros(n, int) + found_in
+        self.found_in = np.zeros(n, int) + found_in
         self.number = np.zeros(n, int) + number
         self.seeded = np.zeros(n, bool) | seeded
-        # How far from its first place a star may go [pix], and the inverse
-        # variance with which it is held there.
         self.bound, self.hold = np.zeros(n) + bound, np.zeros(n) + hold
-        # The Gaussians of each star's PSF, filled in when it is drawn.
-        self.rows = np.empty((n, n_rows, 6))
-        self.paces = np.empty((n, n_rows, 4))
-        self.count = np.zeros(n, int)
+
+    @classmethod
+    def of_columns(cls, columns):
+        """Return stars with these columns, not copied."""
+        new = cls.__new__(cls)
+        vars(new).update(columns)
+        return new
+
+    @classmethod
+    def joined(cls, parts):
+        """Put stars with the same columns one after the other."""
+        return cls.of_columns({
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in vars(parts[0])})
 
     def __len__(self):
         return self.x.size
@@ -43,16 +61,54 @@ class Stars:
         """Whether each star is one of a given list."""
         return self.number >= 0
 
-    def select(self, chosen):
-        """Keep the chosen stars only."""
-        for name in self.COLUMNS:
-            setattr(self, name, getattr(self, name)[chosen])
+    @property
+    def sources(self):
+        """Positions and fluxes as the kernels take them."""
+        return kernels.Sources(self.x, self.y, self.flux)
 
-    def append(self, other):
-        """Add stars."""
-        for name in self.COLUMNS:
-            setattr(self, name, np.concatenate([getattr(self, name),
-                                                getattr(other, name)]))
+    @property
+    def drift(self):
+        """How far each star is from where it started (2, n) [pix]."""
+        return np.stack([self.x - self.x_init, self.y - self.y_init])
+
+    def chosen(self, which):
+        """Return the chosen stars, in that order."""
+        return self.of_columns({name: column[which]
+                                for name, column in vars(self).items()})
+
+    def replaced(self, **columns):
+        """Return the stars with other columns, or with more."""
+        return self.of_columns(vars(self) | columns)
+
+    def moved(self, x, y):
+        """Return the stars with (x, y) added to their positions."""
+        return self.replaced(x=self.x + x, y=self.y + y,
+                             x_init=self.x_init + x, y_init=self.y_init + y)
+
+    def sort(self, *keys):
+        """Order the stars, column by column to save memory."""
+        order = np.lexsort([getattr(self, key) for key in keys[::-1]])
+        for name, column in vars(self).items():
+            setattr(self, name, column[order])
+
+    def take(self, step):
+        """Change flux, x and y by a step (n, 3)."""
+        self.flux = self.flux + step[:, 0]
+        self.x = self.x + step[:, 1]
+        self.y = self.y + step[:, 2]
+
+    def bind(self, which, entries):
+        """Make some stars those of entries of a list, within their bounds."""
+        for name in ('number', 'bound', 'x_init', 'y_init'):
+            getattr(self, name)[which] = getattr(entries, name)
+        for place, start in ((self.x, self.x_init), (self.y, self.y_init)):
+            place[which] = start[which] + np.clip(
+                place[which] - start[which], -entries.bound, entries.bound)
+
+    def brighten(self, which, more):
+        """Let some stars start from a higher flux."""
+        self.flux[which] += more
+        self.flux_init[which] = self.flux[which]
 
 
 @dataclass(frozen=True)
@@ -74,15 +130,14 @@ class Neighbours:
     @classmethod
     def of(cls, x, y):
         """List the pairs of stars that are solved for together."""
-        cell, columns, start = _cells(x, y)
-        place = (x, y, _PAIR_DISTANCE, cell, columns, start,
-                 np.argsort(cell, kind='stable'))
+        cells = _cells(x, y)
         count = np.empty(x.size, np.int64)
-        kernels.count_near(*place, count)
+        kernels.count_near(x, y, _PAIR_DISTANCE, cells, count)
         indptr = np.concatenate([[0], np.cumsum(count)])
         neighbour, twin = np.empty((2, indptr[-1]), np.int64)
         gap = np.empty(indptr[-1])
-        kernels.list_near(*place, indptr, neighbour, gap, twin)
+        kernels.list_near(x, y, _PAIR_DISTANCE, cells,
+                          kernels.Pairs(indptr, neighbour, twin), gap)
         has = count > 0
         nearest, distance = np.full(x.size, -1), np.full(x.size, np.inf)
         nearest[has] = neighbour[indptr[:-1][has]]
@@ -90,13 +145,20 @@ class Neighbours:
         return cls(indptr, neighbour, twin,
                    np.repeat(np.arange(x.size), count), nearest, distance)
 
+    @property
+    def pairs(self):
+        """The pairs as the kernels take them."""
+        return kernels.Pairs(self.indptr, self.neighbour, self.twin)
+
 
 def _cells(x, y):
-    """Return each star's cell, how many are in a row, where each starts."""
+    """Sort points into cells as wide as pairs reach."""
     row, column = (
         (np.floor((v - v.min()) / _PAIR_DISTANCE).astype(int) + 1
          if v.size else np.empty(0, int)) for v in (y, x))
     columns = column.max(initial=0) + 2
     cell = row * columns + column
     count = np.bincount(cell, minlength=(row.max(initial=0) + 2) * columns)
-    return cell, columns, np.concatenate([[0], np.cumsum(count)])
+    return kernels.Cells(cell, int(columns),
+                         np.concatenate([[0], np.cumsum(count)]),
+                         np.argsort(cell, kind='stable'))

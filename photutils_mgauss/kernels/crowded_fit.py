@@ -1,161 +1,80 @@
 """All stars of a crowded image and its background, fitted together."""
-from math import ceil, exp, floor, log, sqrt
+from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 
-from photutils_mgauss.kernels.gaussian import fast_exp
-from photutils_mgauss.kernels.image import ERRORS, add_sampled, add_star
 from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import (
     _cholesky,
     _factor_inverse_columns,
     _invert_3x3,
 )
-from photutils_mgauss.kernels.tile import LANES, add_gaussian
 
-# Crowded fields: all stars of an image together. Star i is fitted on a square
-# stamp of width[i] pixels, odd, whose first pixel is (left, bottom)[i]; its
-# pixels lie in jets (3, total) from offset[i] on, row by row: the PSF of unit
-# flux and its derivatives by the star's x and y. Stamps may reach over the
-# edges of the image. Parameters are ordered flux, x, y.
+# Star i lies on a stamp (`crowded_stamps`); its parameters are ordered flux,
+# x, y.
 
-@kernel
-def star_stamps(chosen, x, y, left, bottom, width, offset, rows, strides,
-                count, integrated, jets):
+# The covariance of a star is that with so many stars free, itself included.
+_MOST_FREE = 13
+
+
+class Cells(NamedTuple):
     """
-    Fill the stamps of the chosen stars.
+    Points sorted into square cells, in rows of so many columns.
 
-    Star i's PSF are the first count[i] rows of rows[i]; paces is as of
-    `paces`.
+    Nothing is in the outermost cells; cell (n,) is where each point is, order
+    lists the points of cell c from start[c] to start[c + 1].
     """
-    widest = 0
-    for i in chosen:
-        widest = max(widest, width[i])
-    walk = np.empty(4 * LANES)
-    tile = np.empty(3 * LANES * widest)
-    for i in chosen:
-        w = width[i]
-        for first in range(0, w, LANES):
-            height = min(LANES, w - first)
-            walk[:] = 0.0
-            tile[:3 * LANES * w] = 0.0
-            for k in range(count[i]):
-                a, mx, my, p, s, q = rows[i, k]
-                add_gaussian(a, left[i] - x[i] - mx,
-                             bottom[i] + first - y[i] - my, p, s, q,
-                             strides[i, k], 0.0, 0.0, integrated, height, w,
-                             walk, tile)
-            for j in range(height):
-                to = offset[i] + (first + j) * w
-                for k in range(w):
-                    at = 3 * LANES * k + j
-                    jets[0, to + k] = tile[at]
-                    jets[1, to + k] = tile[at + LANES]
-                    jets[2, to + k] = tile[at + 2 * LANES]
+
+    cell: np.ndarray
+    columns: int
+    start: np.ndarray
+    order: np.ndarray
 
 
-@inner
-def _walk_rows(start, end, way, fall, first, g, r, image):
-    """Add g (n,) to rows start, start + way, ... end of image, r its fall."""
-    for j in range(start, end + way, way):
-        row = image[j]
-        for i in range(g.size):
-            row[first + i] += g[i]
-            g[i] *= r[i]
-            r[i] *= fall
-
-
-@inner
-def _add_lanes(peak, cx, cy, p, s, q, reach, lanes, image):
+class Pairs(NamedTuple):
     """
-    Add a Gaussian, sampled at pixel centres, to a box of the image.
+    Neighbours as rows of a sparse matrix.
 
-    The box is that of the ellipse where the exponent is -reach / 2. Rows are
-    walked outward from the peak, all columns of the box at once; lanes is
-    (4, n), n at least the length of a row of the image.
+    Star i's are neighbour[indptr[i]:indptr[i + 1]]; twin is where the same
+    pair stands the other way round.
     """
-    ny, nx = image.shape
-    half_x, half_y = sqrt(reach * (1 / p + s * s / q)), sqrt(reach / q)
-    if p * abs(s) * half_x > 300:
-        add_sampled(peak, cx, cy, p, s, q, reach, image)
-        return
-    first = max(0, int(ceil(cx - half_x)))
-    n = min(nx - 1, int(floor(cx + half_x))) + 1 - first
-    low = max(0, int(ceil(cy - half_y)))
-    high = min(ny - 1, int(floor(cy + half_y)))
-    if n <= 0 or low > high:
-        return
-    start = min(max(int(np.rint(cy)), low), high)
-    dy = start - cy
-    t = q + s * s * p
-    fall = exp(-t)
-    g, r, h, d = lanes[0, :n], lanes[1, :n], lanes[2, :n], lanes[3, :n]
-    for i in range(n):
-        u = first + i - cx - s * dy
-        g[i] = peak * fast_exp(-0.5 * (p * u * u + q * dy * dy))
-        slope = q * dy - p * s * u
-        steep = fast_exp(-abs(slope))
-        up = steep if slope > 0 else 1 / steep
-        r[i] = up
-        d[i] = 1 / up
-    half = exp(-0.5 * t)
-    for i in range(n):
-        r[i] *= half
-        d[i] *= half
-        h[i] = g[i] * d[i]
-        d[i] *= fall
-    _walk_rows(start, high, 1, fall, first, g, r, image)
-    _walk_rows(start - 1, low, -1, fall, first, h, d, image)
+
+    indptr: np.ndarray
+    neighbour: np.ndarray
+    twin: np.ndarray
 
 
-@kernel
-def add_wings(rows, flux, cx, cy, integrated, faintest, lanes, scratch,
-              image):
-    """Add a star, each Gaussian out to where it falls below faintest."""
-    if integrated:
-        add_star(rows, flux, cx, cy, True, faintest, scratch, image)
-        return
-    for k in range(rows.shape[0]):
-        a, mx, my, p, s, q = rows[k]
-        peak = flux * a
-        ratio = abs(peak) / faintest
-        if ratio > 1:
-            _add_lanes(peak, cx + mx, cy + my, p, s, q, 2 * log(ratio), lanes,
-                       image)
-
-
-@kernel
-def add_stars(chosen, sign, x, y, flux, left, bottom, width, offset, wing,
-              jets, rows, count, integrated, faintest, image):
+class StarEquations(NamedTuple):
     """
-    Add sign times the chosen stars to the image.
+    Normal equations of the stars.
 
-    A star whose wing (half a width, integer) reaches over its stamp is drawn
-    afresh, each Gaussian out to where it falls below faintest; others are
-    copied from it.
+    Each star's own matrix (n, 3, 3) and gradient (n, 3), the sums of weighted
+    derivatives that couple it to the background, coupling (n, 3), and the
+    matrices of pairs, blocks (n_pairs, 3, 3).
     """
-    ny, nx = image.shape
-    scratch = np.empty((3, ERRORS.size))
-    lanes = np.empty((4, nx))
-    for i in chosen:
-        w = width[i]
-        if wing[i] <= w // 2:
-            for j in range(max(0, -bottom[i]), min(w, ny - bottom[i])):
-                first = offset[i] + j * w - left[i]
-                for k in range(max(0, left[i]), min(left[i] + w, nx)):
-                    image[bottom[i] + j, k] += (sign * flux[i]
-                                                * jets[0, first + k])
-            continue
-        grow = wing[i] - w // 2
-        x_low = max(0, left[i] - grow)
-        x_high = min(nx, left[i] + w + grow)
-        y_low = max(0, bottom[i] - grow)
-        y_high = min(ny, bottom[i] + w + grow)
-        if x_low >= x_high or y_low >= y_high:
-            continue
-        add_wings(rows[i, :count[i]], sign * flux[i], x[i] - x_low,
-                  y[i] - y_low, integrated, faintest, lanes, scratch,
-                  image[y_low:y_high, x_low:x_high])
+
+    matrix: np.ndarray
+    gradient: np.ndarray
+    coupling: np.ndarray
+    blocks: np.ndarray
+
+
+class MeshEquations(NamedTuple):
+    """
+    Normal equations of the nodes of a background.
+
+    The matrix has a diagonal (m,), and -tie between nodes that are
+    neighbours, in rows of so many columns. Stars couple to four nodes each,
+    node (n, 4), with the shares share (n, 4).
+    """
+
+    diagonal: np.ndarray
+    gradient: np.ndarray
+    tie: float
+    columns: int
+    node: np.ndarray
+    share: np.ndarray
 
 
 @kernel
@@ -168,7 +87,8 @@ def mesh_sums(weight, residual, background, rows, columns, n_columns, clip,
     the model; and that times what of those pixels is no star's. Pixels
     belong to the nodes of rows (ny,) and columns (nx,).
     """
-    out[:] = 0
+    for node in range(out.shape[0]):
+        out[node, 0] = out[node, 1] = out[node, 2] = 0.0
     for j in range(weight.shape[0]):
         first = rows[j] * n_columns
         for i in range(weight.shape[1]):
@@ -180,42 +100,46 @@ def mesh_sums(weight, residual, background, rows, columns, n_columns, clip,
                 out[node, 2] += w * (r + background[j, i])
 
 
+@inner
+def _next_row(i, row, cells):
+    """Return where the points around i begin and end, in a row of cells."""
+    middle = cells.cell[i] + row * cells.columns
+    return cells.start[middle - 1], cells.start[middle + 2]
+
+
 @kernel
-def count_near(x, y, reach, cell, columns, start, order, count):
+def count_near(x, y, reach, cells, count):
     """
     Put the number of other points within reach of each into count (n,).
 
-    Points lie in cells as wide as reach, in rows of so many columns with
-    nothing in the outermost; cell (n,) is where each is, order lists the
-    points of cell c from start[c] to start[c + 1].
+    Cells are as wide as reach.
     """
     for i in range(x.size):
         count[i] = 0
         for row in range(-1, 2):
-            middle = cell[i] + row * columns
-            for at in range(start[middle - 1], start[middle + 2]):
-                j = order[at]
+            first, last = _next_row(i, row, cells)
+            for at in range(first, last):
+                j = cells.order[at]
                 if j != i and sqrt((x[j] - x[i])**2
                                    + (y[j] - y[i])**2) <= reach:
                     count[i] += 1
 
 
 @kernel
-def list_near(x, y, reach, cell, columns, start, order, indptr, neighbour,
-              distance, twin):
+def list_near(x, y, reach, cells, pairs, distance):
     """
     List the points within reach of each, nearest first.
 
-    Those of point i go into neighbour from indptr[i] on, with their distance;
-    twin says where the same pair stands the other way round. For the rest
-    see `count_near`.
+    Fills neighbour and twin of the pairs, and distance (n_pairs,). Cells are
+    as wide as reach.
     """
+    indptr, neighbour, twin = pairs
     for i in range(x.size):
         end = indptr[i]
         for row in range(-1, 2):
-            middle = cell[i] + row * columns
-            for at in range(start[middle - 1], start[middle + 2]):
-                j = order[at]
+            first, last = _next_row(i, row, cells)
+            for at in range(first, last):
+                j = cells.order[at]
                 gap = sqrt((x[j] - x[i])**2 + (y[j] - y[i])**2)
                 if j == i or gap > reach:
                     continue
@@ -230,21 +154,23 @@ def list_near(x, y, reach, cell, columns, start, order, indptr, neighbour,
                 end += 1
     for i in range(x.size):
         for pair in range(indptr[i], indptr[i + 1]):
-            j = neighbour[pair]
-            for other in range(indptr[j], indptr[j + 1]):
-                if neighbour[other] == i:
-                    twin[pair] = other
+            twin[pair] = find_pair(neighbour[pair], i, indptr, neighbour)
+
+
+@inner
+def find_pair(i, j, indptr, neighbour):
+    """Return where star j stands among the neighbours of i, -1 for nowhere."""
+    for pair in range(indptr[i], indptr[i + 1]):
+        if neighbour[pair] == j:
+            return pair
+    return -1
 
 
 @kernel
-def own_equations(flux, left, bottom, width, offset, jets, weight, residual,
-                  matrix, gradient, reach):
-    """
-    Put each star's own normal equations into matrix (n, 3, 3), gradient.
-
-    reach (n, 3) takes the sums of weighted derivatives, which couple the
-    star to the background.
-    """
+def own_equations(flux, stamps, weight, residual, equations):
+    """Fill matrix, gradient and coupling of each star."""
+    left, bottom, width, offset, derivatives = stamps
+    matrix, gradient, coupling, _ = equations
     ny, nx = weight.shape
     for i in range(flux.size):
         w = width[i]
@@ -255,9 +181,9 @@ def own_equations(flux, left, bottom, width, offset, jets, weight, residual,
             row = bottom[i] + j
             for k in range(max(0, left[i]), min(left[i] + w, nx)):
                 v = weight[row, k]
-                d0 = jets[0, first + k]
-                d1 = jets[1, first + k]
-                d2 = jets[2, first + k]
+                d0 = derivatives[0, first + k]
+                d1 = derivatives[1, first + k]
+                d2 = derivatives[2, first + k]
                 e0, e1, e2 = v * d0, v * d1, v * d2
                 r = residual[row, k]
                 m00 += d0 * e0
@@ -282,65 +208,69 @@ def own_equations(flux, left, bottom, width, offset, jets, weight, residual,
         gradient[i, 0] = g0
         gradient[i, 1] = f * g1
         gradient[i, 2] = f * g2
-        reach[i, 0] = s0
-        reach[i, 1] = f * s1
-        reach[i, 2] = f * s2
+        coupling[i, 0] = s0
+        coupling[i, 1] = f * s1
+        coupling[i, 2] = f * s2
 
 
 @kernel
-def pair_blocks(indptr, neighbour, twin, flux, left, bottom, width, offset,
-                jets, weight, blocks):
-    """
-    Put the 3 x 3 normal matrices of neighbours into blocks (n_pairs, 3, 3).
-
-    Star i's neighbours are neighbour[indptr[i]:indptr[i + 1]]; twin is where
-    the same pair stands the other way round.
-    """
-    ny, nx = weight.shape
+def pair_blocks(flux, stamps, pairs, weight, blocks):
+    """Put the normal matrices of pairs into blocks (n_pairs, 3, 3)."""
+    indptr, neighbour, twin = pairs
     for i in range(flux.size):
         for pair in range(indptr[i], indptr[i + 1]):
             j = neighbour[pair]
             if j < i:
                 continue
-            b00 = b01 = b02 = b10 = b11 = b12 = b20 = b21 = b22 = 0.0
-            x_low = max(0, left[i], left[j])
-            x_high = min(nx, left[i] + width[i], left[j] + width[j])
-            for row in range(max(0, bottom[i], bottom[j]),
-                             min(ny, bottom[i] + width[i],
-                                 bottom[j] + width[j])):
-                first = offset[i] + (row - bottom[i]) * width[i] - left[i]
-                other = offset[j] + (row - bottom[j]) * width[j] - left[j]
-                for k in range(x_low, x_high):
-                    v = weight[row, k]
-                    e0 = v * jets[0, other + k]
-                    e1 = v * jets[1, other + k]
-                    e2 = v * jets[2, other + k]
-                    d0 = jets[0, first + k]
-                    d1 = jets[1, first + k]
-                    d2 = jets[2, first + k]
-                    b00 += d0 * e0
-                    b01 += d0 * e1
-                    b02 += d0 * e2
-                    b10 += d1 * e0
-                    b11 += d1 * e1
-                    b12 += d1 * e2
-                    b20 += d2 * e0
-                    b21 += d2 * e1
-                    b22 += d2 * e2
             block = blocks[pair]
-            block[0, 0], block[0, 1], block[0, 2] = b00, b01, b02
-            block[1, 0], block[1, 1], block[1, 2] = b10, b11, b12
-            block[2, 0], block[2, 1], block[2, 2] = b20, b21, b22
-            block[1:] *= flux[i]
-            block[:, 1:] *= flux[j]
+            _pair_block(i, j, stamps, weight, block)
             for m in range(3):
                 for n in range(3):
+                    if m > 0:
+                        block[m, n] *= flux[i]
+                    if n > 0:
+                        block[m, n] *= flux[j]
                     blocks[twin[pair], n, m] = block[m, n]
 
 
 @inner
-def _apply_mesh(v, mesh, tie, columns, out):
-    """Multiply by the matrix of a background, as of `solve_joint`."""
+def _pair_block(i, j, stamps, weight, block):
+    """Put the products of the derivatives of two stars into block (3, 3)."""
+    left, bottom, width, offset, derivatives = stamps
+    ny, nx = weight.shape
+    b00 = b01 = b02 = b10 = b11 = b12 = b20 = b21 = b22 = 0.0
+    x_low = max(0, left[i], left[j])
+    x_high = min(nx, left[i] + width[i], left[j] + width[j])
+    for row in range(max(0, bottom[i], bottom[j]),
+                     min(ny, bottom[i] + width[i], bottom[j] + width[j])):
+        first = offset[i] + (row - bottom[i]) * width[i] - left[i]
+        other = offset[j] + (row - bottom[j]) * width[j] - left[j]
+        for k in range(x_low, x_high):
+            v = weight[row, k]
+            e0 = v * derivatives[0, other + k]
+            e1 = v * derivatives[1, other + k]
+            e2 = v * derivatives[2, other + k]
+            d0 = derivatives[0, first + k]
+            d1 = derivatives[1, first + k]
+            d2 = derivatives[2, first + k]
+            b00 += d0 * e0
+            b01 += d0 * e1
+            b02 += d0 * e2
+            b10 += d1 * e0
+            b11 += d1 * e1
+            b12 += d1 * e2
+            b20 += d2 * e0
+            b21 += d2 * e1
+            b22 += d2 * e2
+    block[0, 0], block[0, 1], block[0, 2] = b00, b01, b02
+    block[1, 0], block[1, 1], block[1, 2] = b10, b11, b12
+    block[2, 0], block[2, 1], block[2, 2] = b20, b21, b22
+
+
+@inner
+def _apply_mesh(v, mesh, out):
+    """Multiply v (m,) by the matrix of a background."""
+    diagonal, tie, columns = mesh.diagonal, mesh.tie, mesh.columns
     for m in range(v.size):
         column = m % columns
         near = 0.0
@@ -352,32 +282,35 @@ def _apply_mesh(v, mesh, tie, columns, out):
             near += v[m - columns]
         if m < v.size - columns:
             near += v[m + columns]
-        out[m] = mesh[m] * v[m] - tie * near
+        out[m] = diagonal[m] * v[m] - tie * near
 
 
 @inner
-def _apply_joint(v, mesh_v, matrix, indptr, neighbour, blocks, node, share,
-                 reach, mesh, tie, columns, out, mesh_out):
+def _apply_joint(v, mesh_v, stars, pairs, mesh, out, mesh_out):
     """
     Multiply by the joint normal matrix of stars and background.
 
     Returns the product of v and the outcome.
     """
-    _apply_mesh(mesh_v, mesh, tie, columns, mesh_out)
+    _apply_mesh(mesh_v, mesh, mesh_out)
+    matrix, _, coupling, blocks = stars
+    indptr, neighbour, _ = pairs
+    node, share = mesh.node, mesh.share
     product = 0.0
     for i in range(v.shape[0]):
         level = 0.0
         for c in range(4):
             level += share[i, c] * mesh_v[node[i, c]]
-        o0 = reach[i, 0] * level
-        o1 = reach[i, 1] * level
-        o2 = reach[i, 2] * level
+        o0 = coupling[i, 0] * level
+        o1 = coupling[i, 1] * level
+        o2 = coupling[i, 2] * level
         a = matrix[i]
         v0, v1, v2 = v[i, 0], v[i, 1], v[i, 2]
         o0 += a[0, 0] * v0 + a[0, 1] * v1 + a[0, 2] * v2
         o1 += a[1, 0] * v0 + a[1, 1] * v1 + a[1, 2] * v2
         o2 += a[2, 0] * v0 + a[2, 1] * v1 + a[2, 2] * v2
-        light = reach[i, 0] * v0 + reach[i, 1] * v1 + reach[i, 2] * v2
+        light = (coupling[i, 0] * v0 + coupling[i, 1] * v1
+                 + coupling[i, 2] * v2)
         for c in range(4):
             mesh_out[node[i, c]] += share[i, c] * light
         for pair in range(indptr[i], indptr[i + 1]):
@@ -428,53 +361,106 @@ def _extend(x, scale, y):
         x[i] = y[i] + scale * x[i]
 
 
+@inner
+def _inverses(matrix):
+    """Return the inverse of each star's own matrix, 0 where singular."""
+    inverse = np.empty(matrix.shape)
+    for i in range(matrix.shape[0]):
+        _invert_3x3(matrix[i], inverse[i])
+    return inverse
+
+
 @kernel
-def solve_joint(matrix, gradient, indptr, neighbour, blocks, node, share,
-                reach, mesh, tie, columns, mesh_gradient, tolerance,
-                max_steps, step, mesh_step):
+def solve_joint(stars, pairs, mesh, tolerance, max_steps, step, mesh_step):
     """
     Solve the joint normal equations by preconditioned conjugate gradients.
 
-    Stars couple to their neighbours (`pair_blocks`) and to the four nodes
-    node (n, 4) of the background around them, with the bilinear shares
-    share (n, 4). The background's own matrix has the diagonal mesh (m,) and
-    -tie between nodes that are neighbours, in rows of so many columns. Each
-    star's own block is the preconditioner; stars whose block is singular do
-    not move. Returns the number of steps.
+    Each star's own block is the preconditioner; stars whose block is singular
+    do not move. step (n, 3) and mesh_step (m,) begin at zero. Returns the
+    number of steps.
     """
-    n = gradient.shape[0]
-    inverse = np.empty((n, 3, 3))
-    for i in range(n):
-        _invert_3x3(matrix[i], inverse[i])
-    step[:] = 0
-    mesh_step[:] = 0
-    r, mesh_r = gradient.copy(), mesh_gradient.copy()
+    inverse = _inverses(stars.matrix)
+    r, mesh_r = stars.gradient.copy(), mesh.gradient.copy()
     z, mesh_z = np.empty_like(r), np.empty_like(mesh_r)
     # A preconditioner of zero keeps singular stars out of z, and so of v.
-    rz = _precondition(inverse, mesh, r, mesh_r, z, mesh_z)
+    rz = _precondition(inverse, mesh.diagonal, r, mesh_r, z, mesh_z)
     v, mesh_v = z.copy(), mesh_z.copy()
     a, mesh_a = np.empty_like(r), np.empty_like(mesh_r)
     goal = tolerance * tolerance * rz
     for count in range(max_steps):
         if not rz > goal:
             return count
-        alpha = rz / _apply_joint(v, mesh_v, matrix, indptr, neighbour,
-                                  blocks, node, share, reach, mesh, tie,
-                                  columns, a, mesh_a)
+        alpha = rz / _apply_joint(v, mesh_v, stars, pairs, mesh, a, mesh_a)
         _add_scaled(step.reshape(-1), alpha, v.reshape(-1))
         _add_scaled(mesh_step, alpha, mesh_v)
         _add_scaled(r.reshape(-1), -alpha, a.reshape(-1))
         _add_scaled(mesh_r, -alpha, mesh_a)
         before = rz
-        rz = _precondition(inverse, mesh, r, mesh_r, z, mesh_z)
+        rz = _precondition(inverse, mesh.diagonal, r, mesh_r, z, mesh_z)
         _extend(v.reshape(-1), rz / before, z.reshape(-1))
         _extend(mesh_v, rz / before, mesh_z)
     return max_steps
 
 
+@inner
+def put_block(blocks, which, row, column, a):
+    """Put one of blocks (n, 3, 3) into a matrix of blocks."""
+    for r in range(3):
+        for c in range(3):
+            a[3 * row + r, 3 * column + c] = blocks[which, r, c]
+
+
+@inner
+def _members(i, indptr, neighbour, members):
+    """Put a star and its first neighbours into members; return how many."""
+    members[0] = i
+    count = 1
+    for pair in range(indptr[i], indptr[i + 1]):
+        if count == members.size:
+            break
+        members[count] = neighbour[pair]
+        count += 1
+    return count
+
+
+@inner
+def _joint_matrix(members, count, matrix, blocks, indptr, neighbour, where,
+                  a):
+    """
+    Put the normal matrix of some stars into a (3 count, 3 count).
+
+    where (n,) is -1 before and after.
+    """
+    for m in range(count):
+        where[members[m]] = m
+    for r in range(3 * count):
+        for c in range(3 * count):
+            a[r, c] = 0.0
+    for m in range(count):
+        star = members[m]
+        put_block(matrix, star, m, m, a)
+        for pair in range(indptr[star], indptr[star + 1]):
+            other = where[neighbour[pair]]
+            if other >= 0:
+                put_block(blocks, pair, m, other, a)
+    for m in range(count):
+        where[members[m]] = -1
+
+
+@inner
+def _scale_matrix(a, size, scale):
+    """Make the diagonal of a matrix 1; scale takes by what rows went."""
+    for m in range(size):
+        scale[m] = 1 / sqrt(a[m, m]) if a[m, m] > 0 else 0.0
+    for r in range(size):
+        for c in range(size):
+            a[r, c] *= scale[r] * scale[c]
+        if scale[r] == 0:
+            a[r, r] = 1.0
+
+
 @kernel
-def joint_covariances(matrix, indptr, neighbour, blocks, partner, covariance,
-                      correlation):
+def joint_covariances(stars, pairs, partner, covariance, correlation):
     """
     Put the covariance of each star, neighbours free, into covariance.
 
@@ -483,51 +469,31 @@ def joint_covariances(matrix, indptr, neighbour, blocks, partner, covariance,
     neighbours. A star's normal matrix is that of itself and up to 12 of its
     neighbours, those that come first. NaN where it is singular.
     """
-    most = 13
-    members = np.empty(most, np.int64)
-    where = np.full(matrix.shape[0], -1, np.int64)
-    a = np.empty((3 * most, 3 * most))
-    scale = np.empty(3 * most)
-    columns = np.empty((3 * most, 3))
-    alone = np.empty((3 * most, 1))
-    for i in range(matrix.shape[0]):
-        count = 1
-        members[0] = i
-        for pair in range(indptr[i], indptr[i + 1]):
-            if count == most:
-                break
-            members[count] = neighbour[pair]
-            count += 1
+    matrix, _, _, blocks = stars
+    indptr, neighbour, _ = pairs
+    n = matrix.shape[0]
+    members = np.empty(_MOST_FREE, np.int64)
+    where = np.full(n, -1, np.int64)
+    a = np.empty((3 * _MOST_FREE, 3 * _MOST_FREE))
+    scale = np.empty(3 * _MOST_FREE)
+    columns = np.empty((3 * _MOST_FREE, 3))
+    alone = np.empty((3 * _MOST_FREE, 1))
+    for i in range(n):
+        count = _members(i, indptr, neighbour, members)
         size = 3 * count
-        for m in range(count):
-            where[members[m]] = m
-        a[:size, :size] = 0
-        for m in range(count):
-            star = members[m]
-            a[3 * m:3 * m + 3, 3 * m:3 * m + 3] = matrix[star]
-            for pair in range(indptr[star], indptr[star + 1]):
-                other = where[neighbour[pair]]
-                if other >= 0:
-                    for r in range(3):
-                        for c in range(3):
-                            a[3 * m + r, 3 * other + c] = blocks[pair, r, c]
-        for m in range(count):
-            where[members[m]] = -1
-        for m in range(size):
-            scale[m] = 1 / sqrt(a[m, m]) if a[m, m] > 0 else 0.0
-        for r in range(size):
-            for c in range(size):
-                a[r, c] *= scale[r] * scale[c]
-            if scale[r] == 0:
-                a[r, r] = 1.0
+        _joint_matrix(members, count, matrix, blocks, indptr, neighbour, where,
+                      a)
+        _scale_matrix(a, size, scale)
         correlation[i] = 0.0
-        if scale[0] == 0 or not _cholesky(a, size):
-            covariance[i] = np.nan
-            continue
-        _factor_inverse_columns(a, size, 0, 3, columns)
+        solved = scale[0] > 0 and _cholesky(a, size)
+        if solved:
+            _factor_inverse_columns(a, size, 0, 3, columns)
         for r in range(3):
             for c in range(3):
-                covariance[i, r, c] = columns[r, c] * scale[r] * scale[c]
+                covariance[i, r, c] = (columns[r, c] * scale[r] * scale[c]
+                                       if solved else np.nan)
+        if not solved:
+            continue
         for m in range(1, count):
             if members[m] == partner[i]:
                 _factor_inverse_columns(a, size, 3 * m, 1, alone)

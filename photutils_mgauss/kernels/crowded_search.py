@@ -1,10 +1,67 @@
 """Finding the stars of a crowded image."""
 from math import ceil, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
+from photutils_mgauss.kernels.crowded_fit import find_pair, put_block
 from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import _cholesky
+
+# So many stars around a pixel are free to readjust when a further one is
+# looked for there, those within this distance [pix].
+_MOST_FREE = 4
+_FREE_DISTANCE = 3.0
+
+
+class Planes(NamedTuple):
+    """Images of a tile: weights, the residual, and the light of stars."""
+
+    weight: np.ndarray
+    residual: np.ndarray
+    light: np.ndarray
+
+
+class Templates(NamedTuple):
+    """
+    Stamps (cells along y, along x, 2h + 1, 2h + 1) of a star.
+
+    Each serves for cell x cell pixels.
+    """
+
+    stamps: np.ndarray
+    cell: int
+
+
+class Fit(NamedTuple):
+    """The stars that are known, and the equations they were fitted with."""
+
+    sources: tuple
+    stamps: tuple
+    pairs: tuple
+    equations: tuple
+
+
+class Limits(NamedTuple):
+    """
+    Where a further star is looked for.
+
+    Within reach of a star [pix], where more than the fraction least of the
+    information is left, and if it may reach the significance threshold.
+    """
+
+    reach: float
+    least: float
+    threshold: float
+
+
+class _Scratch(NamedTuple):
+    """Stars around a pixel, their factors, two right sides, and sums."""
+
+    members: np.ndarray
+    matrix: np.ndarray
+    right: np.ndarray
+    sums: np.ndarray
 
 
 @kernel
@@ -21,7 +78,10 @@ def score(residual, weight, template, x_low, x_high, y_low, y_high, hint,
     """
     ny, nx = residual.shape
     h = template.shape[0] // 2
-    power = (template**2).sum()
+    power = 0.0
+    for j in range(2 * h + 1):
+        for i in range(2 * h + 1):
+            power += template[j, i]**2
     for y in range(y_low, y_high):
         for x in range(x_low, x_high):
             rs = ws = 0.0
@@ -82,31 +142,127 @@ def _template_products(x, y, template, weight, residual, light, out):
 
 
 @inner
-def _template_overlap(x, y, template, weight, left, bottom, width, jets, flux,
-                      out):
-    """Put the sums of t w times a star's derivatives into out (3,)."""
+def _template_overlap(x, y, template, weight, left, bottom, width, offset,
+                      derivatives, out):
+    """Put the sums of t w times derivatives of a star into out (3, ...)."""
     ny, nx = weight.shape
     h = template.shape[0] // 2
     o0 = o1 = o2 = 0.0
     x_low, x_high = max(0, left, x - h), min(nx, left + width, x + h + 1)
     for row in range(max(0, bottom, y - h),
                      min(ny, bottom + width, y + h + 1)):
-        first = (row - bottom) * width - left
+        first = offset + (row - bottom) * width - left
         for k in range(x_low, x_high):
             tw = template[row - y + h, k - x + h] * weight[row, k]
-            o0 += tw * jets[0, first + k]
-            o1 += tw * jets[1, first + k]
-            o2 += tw * jets[2, first + k]
-    out[0] = o0
-    out[1] = flux * o1
-    out[2] = flux * o2
+            o0 += tw * derivatives[0, first + k]
+            o1 += tw * derivatives[1, first + k]
+            o2 += tw * derivatives[2, first + k]
+    out[0, 0] = o0
+    out[1, 0] = o1
+    out[2, 0] = o2
+
+
+@inner
+def _stars_around(column, row, i, x, y, indptr, neighbour, members):
+    """
+    Put the stars around a pixel into members; return how many.
+
+    None if another than star i is nearest to it.
+    """
+    gap = (x[i] - column)**2 + (y[i] - row)**2
+    members[0] = i
+    count = 1
+    for pair in range(indptr[i], indptr[i + 1]):
+        j = neighbour[pair]
+        other = (x[j] - column)**2 + (y[j] - row)**2
+        if other < gap:
+            return 0
+        if other < _FREE_DISTANCE * _FREE_DISTANCE and count < members.size:
+            members[count] = j
+            count += 1
+    return count
+
+
+@inner
+def _gather(count, members, equations, indptr, neighbour, a, right):
+    """Put the equations of the stars around a pixel into a and right."""
+    matrix, gradient, _, blocks = equations
+    for m in range(count):
+        star = members[m]
+        for c in range(3):
+            right[3 * m + c, 1] = gradient[star, c]
+        put_block(matrix, star, m, m, a)
+        for n in range(m):
+            pair = find_pair(star, members[n], indptr, neighbour)
+            if pair >= 0:
+                put_block(blocks, pair, m, n, a)
+                continue
+            for c in range(3):
+                for d in range(3):
+                    a[3 * m + c, 3 * n + d] = 0.0
+
+
+@inner
+def _scale(a, right, size):
+    """Make the diagonal of the lower triangle a bit more than 1."""
+    for c in range(size):
+        s = 1 / sqrt(a[c, c]) if a[c, c] > 0 else 0.0
+        right[c, 0] *= s
+        right[c, 1] *= s
+        for d in range(c + 1):
+            a[c, d] *= s
+        for d in range(c, size):
+            a[d, c] *= s
+        a[c, c] = 1.0 + 1e-9
+
+
+@inner
+def _readjust(size, a, right, sums):
+    """
+    Return information and gradient of a star with the others free.
+
+    From those with the others fixed; the right sides are the others' overlaps
+    with it and their gradient.
+    """
+    g, info = sums[0], sums[1]
+    for c in range(size):
+        u, v = right[c, 0], right[c, 1]
+        for d in range(c):
+            u -= a[c, d] * right[d, 0]
+            v -= a[c, d] * right[d, 1]
+        right[c, 0] = u / a[c, c]
+        right[c, 1] = v / a[c, c]
+        info -= right[c, 0] * right[c, 0]
+        g -= right[c, 0] * right[c, 1]
+    return info, g
+
+
+@inner
+def _score_pixel(x, y, count, fit, template, weight, least, scratch):
+    """Return significance and flux of a star at a pixel, or zeros."""
+    members, a, right, sums = scratch
+    left, bottom, width, offset, derivatives = fit.stamps
+    flux = fit.sources.flux
+    for m in range(count):
+        star = members[m]
+        _template_overlap(x, y, template, weight, left[star], bottom[star],
+                          width[star], offset[star], derivatives,
+                          right[3 * m:])
+        right[3 * m + 1, 0] *= flux[star]
+        right[3 * m + 2, 0] *= flux[star]
+    _gather(count, members, fit.equations, fit.pairs.indptr,
+            fit.pairs.neighbour, a, right)
+    _scale(a, right, 3 * count)
+    if not _cholesky(a, 3 * count):
+        return 0.0, 0.0
+    info, g = _readjust(3 * count, a, right, sums)
+    if info < least * sums[1]:
+        return 0.0, 0.0
+    return g / sqrt(info + sums[2]), g / info
 
 
 @kernel
-def score_beside(x, y, flux, left, bottom, width, offset, jets, matrix,
-                 gradient, indptr, neighbour, blocks, templates, cell, weight,
-                 residual, light, reach, least, threshold, significance,
-                 found):
+def score_beside(fit, templates, planes, limits, significance, flux):
     r"""
     Ask how significant a further star would be on pixels close to stars.
 
@@ -119,100 +275,46 @@ def score_beside(x, y, flux, left, bottom, width, offset, jets, matrix,
 
     where v is the variance of g by errors of the PSF, the sum over pixels of
     :math:`(t w\,\mathrm{light})^2`. Pixels where less than the fraction
-    least of h is left cannot be told from the stars and keep 0. templates is
-    (cells along y, along x, 2h + 1, 2h + 1), each for cell x cell pixels.
+    least of h is left cannot be told from the stars and keep 0. Significance
+    and flux are (ny, nx).
     """
-    ny, nx = residual.shape
-    most = 4
-    members = np.empty(most, np.int64)
-    a = np.empty((3 * most, 3 * most))
-    rhs = np.empty((3 * most, 2))
-    overlap = np.empty(3)
-    sums = np.empty(3)
+    ny, nx = significance.shape
+    px, py, _ = fit.sources
+    indptr, neighbour, _ = fit.pairs
+    weight, residual, light = planes
+    stamps, cell = templates
+    reach, least, threshold = limits
+    size = 3 * _MOST_FREE
+    members, sums = np.empty(_MOST_FREE, np.int64), np.empty(3)
+    scratch = _Scratch(members, np.empty((size, size)), np.empty((size, 2)),
+                       sums)
     side = int(ceil(reach))
-    for i in range(x.size):
-        for row in range(max(0, int(np.rint(y[i])) - side),
-                         min(ny, int(np.rint(y[i])) + side + 1)):
-            for k in range(max(0, int(np.rint(x[i])) - side),
-                           min(nx, int(np.rint(x[i])) + side + 1)):
-                gap = (x[i] - k)**2 + (y[i] - row)**2
-                if gap > reach * reach:
+    for i in range(px.size):
+        row, column = int(np.rint(py[i])), int(np.rint(px[i]))
+        for y in range(max(0, row - side), min(ny, row + side + 1)):
+            for x in range(max(0, column - side),
+                           min(nx, column + side + 1)):
+                if (px[i] - x)**2 + (py[i] - y)**2 > reach * reach:
                     continue
-                members[0] = i
-                count = 1
-                nearest = True
-                for pair in range(indptr[i], indptr[i + 1]):
-                    j = neighbour[pair]
-                    other = (x[j] - k)**2 + (y[j] - row)**2
-                    if other < gap:
-                        nearest = False
-                        break
-                    if other < 9 and count < most:
-                        members[count] = j
-                        count += 1
-                if not nearest:
+                count = _stars_around(x, y, i, px, py, indptr, neighbour,
+                                      members)
+                if count == 0:
                     continue
-                significance[row, k] = 0.0
-                template = templates[row // cell, k // cell]
-                if not _template_products(k, row, template, weight, residual,
-                                          light, sums):
-                    continue
+                significance[y, x] = 0.0
+                template = stamps[y // cell, x // cell]
                 # What the stars' freedom can add is bounded.
-                if not sums[0] > threshold * sqrt(0.3 * least * sums[1]):
-                    continue
-                size = 3 * count
-                for m in range(count):
-                    star = members[m]
-                    _template_overlap(
-                        k, row, template, weight, left[star], bottom[star],
-                        width[star], jets[:, offset[star]:], flux[star],
-                        overlap)
-                    for c in range(3):
-                        rhs[3 * m + c, 0] = overlap[c]
-                        rhs[3 * m + c, 1] = gradient[star, c]
-                        for d in range(3):
-                            a[3 * m + c, 3 * m + d] = matrix[star, c, d]
-                    for n in range(m):
-                        for c in range(3):
-                            for d in range(3):
-                                a[3 * m + c, 3 * n + d] = 0.0
-                        for pair in range(indptr[star], indptr[star + 1]):
-                            if neighbour[pair] == members[n]:
-                                for c in range(3):
-                                    for d in range(3):
-                                        a[3 * m + c, 3 * n + d] = blocks[
-                                            pair, c, d]
-                for c in range(size):
-                    s = 1 / sqrt(a[c, c]) if a[c, c] > 0 else 0.0
-                    rhs[c, 0] *= s
-                    rhs[c, 1] *= s
-                    for d in range(c + 1):
-                        a[c, d] *= s
-                    for d in range(c, size):
-                        a[d, c] *= s
-                    a[c, c] = 1.0 + 1e-9
-                if not _cholesky(a, size):
-                    continue
-                info = sums[1]
-                g = sums[0]
-                for c in range(size):
-                    u, v = rhs[c, 0], rhs[c, 1]
-                    for d in range(c):
-                        u -= a[c, d] * rhs[d, 0]
-                        v -= a[c, d] * rhs[d, 1]
-                    rhs[c, 0] = u / a[c, c]
-                    rhs[c, 1] = v / a[c, c]
-                    info -= rhs[c, 0] * rhs[c, 0]
-                    g -= rhs[c, 0] * rhs[c, 1]
-                if info < least * sums[1]:
-                    continue
-                significance[row, k] = g / sqrt(info + sums[2])
-                found[row, k] = g / info
+                if _template_products(
+                        x, y, template, weight, residual, light, sums) and (
+                        sums[0] > threshold * sqrt(0.3 * least * sums[1])):
+                    strength, brightness = _score_pixel(
+                        x, y, count, fit, template, weight, least, scratch)
+                    if brightness != 0:
+                        significance[y, x] = strength
+                        flux[y, x] = brightness
 
 
 @kernel
-def star_quality(flux, x, y, left, bottom, width, offset, jets, weight,
-                 residual, light, out):
+def star_quality(sources, stamps, planes, out):
     """
     Put sums over each star's stamp into out (n, 6).
 
@@ -221,6 +323,9 @@ def star_quality(flux, x, y, left, bottom, width, offset, jets, weight,
     of the light of all stars, and the share of its information on the flux
     that pixels with weight hold.
     """
+    x, y, flux = sources
+    left, bottom, width, offset, derivatives = stamps
+    weight, residual, light = planes
     ny, nx = weight.shape
     for i in range(flux.size):
         w = width[i]
@@ -231,7 +336,7 @@ def star_quality(flux, x, y, left, bottom, width, offset, jets, weight,
                 column = left[i] + k
                 if not (0 <= row < ny and 0 <= column < nx):
                     continue
-                p = jets[0, offset[i] + j * w + k]
+                p = derivatives[0, offset[i] + j * w + k]
                 power += p * p
                 v = weight[row, column]
                 if v == 0:

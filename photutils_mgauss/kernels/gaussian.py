@@ -191,7 +191,7 @@ def add_values(x, y, x_0, y_0, row, scale, integrated, out):
 
 
 @inner
-def add_jet(x, y, x_0, y_0, row, scales, integrated, out):
+def add_derivatives(x, y, x_0, y_0, row, scales, integrated, out):
     """
     Add value, slope by x_0 and slope by y_0 of a Gaussian to out (3, n).
 
@@ -244,7 +244,7 @@ def gradient(x, y, rows, integrated, out):
 
 
 @kernel
-def jets(x, y, rows, integrated, out):
+def derivatives(x, y, rows, integrated, out):
     """
     Put each Gaussian and its five derivatives into out (K, 6, n).
 

@@ -4,7 +4,7 @@ from math import sqrt
 import numpy as np
 
 from photutils_mgauss.kernels.gaussian import (
-    add_jet,
+    add_derivatives,
     add_values,
     point_gradient,
     point_hessian,
@@ -103,8 +103,8 @@ def differentiate_grid(x, y, x_0, y_0, nodes, x_grid, y_grid, integrated,
     for corner in range(4):
         for row in nodes[index[corner]]:
             if row[0] != 0:
-                add_jet(x, y, x_0, y_0, row, weights[:, corner], integrated,
-                        out)
+                add_derivatives(x, y, x_0, y_0, row, weights[:, corner],
+                                integrated, out)
 
 
 @inner

@@ -72,6 +72,14 @@ def _walk(peak, right, left, fall, start, first, last, row):
 
 
 @inner
+def _span(centre, half, nx):
+    """Return first and last of nx pixels near a centre, and the nearest."""
+    first = max(0, ceil(centre - half))
+    last = min(nx - 1, floor(centre + half))
+    return first, last, min(max(int(np.rint(centre)), first), last)
+
+
+@inner
 def add_sampled(peak, cx, cy, p, s, q, reach, out):
     """Add a Gaussian, sampled at pixel centres, to out (ny, nx)."""
     half = sqrt(reach / q)
@@ -81,11 +89,9 @@ def add_sampled(peak, cx, cy, p, s, q, reach, out):
         dy = j - cy
         centre = cx + s * dy
         width = sqrt(max(0.0, reach - q * dy * dy) / p)
-        first = max(0, ceil(centre - width))
-        last = min(out.shape[1] - 1, floor(centre + width))
+        first, last, start = _span(centre, width, out.shape[1])
         if first > last:
             continue
-        start = min(max(int(np.rint(centre)), first), last)
         u = start - centre
         _walk(peak * exp(-0.5 * (p * u * u + q * dy * dy)),
               exp(-p * (u + 0.5)), exp(-p * (0.5 - u)), fall, start, first,
@@ -125,11 +131,9 @@ def _add_integrated(peak, cx, cy, p, s, q, reach, tolerance, scratch, out):
             dy = j - cy + _POINTS[n_y, b]
             centre = cx + s * dy
             width = sqrt(max(0.0, reach - q * dy * dy) / p) + 0.5
-            first = max(0, ceil(centre - width))
-            last = min(out.shape[1] - 1, floor(centre + width))
+            first, last, start = _span(centre, width, out.shape[1])
             if first > last:
                 continue
-            start = min(max(int(np.rint(centre)), first), last)
             u = start - centre
             ridge = (peak * _SHARES[n_y, b]
                      * exp(-0.5 * (p * u * u + q * dy * dy)))

@@ -13,7 +13,7 @@ from photutils_mgauss.kernels.descent import (
 )
 from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import _factorize, _solve
-from photutils_mgauss.kernels.tile import LANES, fill_jet
+from photutils_mgauss.kernels.tile import LANES, fill_derivatives
 
 # Fits of stars: flux, x and y of each, by Levenberg-Marquardt.
 #
@@ -103,16 +103,16 @@ def _weigh(data, variance, sky, gain, old, residual, weight, chi2):
 
 
 @inner
-def _add_gradient(jet, flux, weight, residual, gradient):
+def _add_gradient(derivatives, flux, weight, residual, gradient):
     """Add a star's part of the right-hand side in one box."""
     b0 = 0.0
     b1 = 0.0
     b2 = 0.0
     for i in range(weight.size):
         wr = weight[i] * residual[i]
-        b0 += wr * jet[0, i]
-        b1 += wr * jet[1, i]
-        b2 += wr * jet[2, i]
+        b0 += wr * derivatives[0, i]
+        b1 += wr * derivatives[1, i]
+        b2 += wr * derivatives[2, i]
     gradient[0] += b0
     gradient[1] += flux * b1
     gradient[2] += flux * b2
@@ -156,12 +156,12 @@ def _add_block(one, flux_1, two, flux_2, weight, block):
 
 
 @inner
-def _add_sky(jet, flux, weight, column):
+def _add_sky(derivatives, flux, weight, column):
     """Add what joins a star and the sky level, in one box."""
     for i in range(weight.size):
-        column[0] += weight[i] * jet[0, i]
-        column[1] += weight[i] * jet[1, i] * flux
-        column[2] += weight[i] * jet[2, i] * flux
+        column[0] += weight[i] * derivatives[0, i]
+        column[1] += weight[i] * derivatives[1, i] * flux
+        column[2] += weight[i] * derivatives[2, i] * flux
 
 
 @inner
@@ -169,25 +169,25 @@ def _model_stars(parameters, n, box, psf, scratch, residual):
     """
     Put the sum of n stars in a box into residual.
 
-    Fills each star's jet, and whether any of it is seen in the box. scratch
-    is (jets, seen, tiling).
+    Fills each star's derivatives, and whether any of it is seen in the box.
+    scratch is (derivatives, seen, tiling).
     """
-    jets, seen, tiling = scratch
+    derivatives, seen, tiling = scratch
     residual[:] = 0.0
     for s in range(n):
-        jet = jets[s, :, :residual.size]
-        fill_jet(parameters[3 * s + 1], parameters[3 * s + 2], box, psf,
-                 tiling, jet)
+        own = derivatives[s, :, :residual.size]
+        fill_derivatives(parameters[3 * s + 1], parameters[3 * s + 2], box,
+                         psf, tiling, own)
         flux = parameters[3 * s]
         top = 0.0
         for i in range(residual.size):
-            residual[i] += flux * jet[0, i]
-            top = max(top, abs(jet[0, i]))
+            residual[i] += flux * own[0, i]
+            top = max(top, abs(own[0, i]))
         seen[s] = top > _UNSEEN
 
 
 @inner
-def _add_equations(parameters, n, fit_sky, jets, seen, weight, residual,
+def _add_equations(parameters, n, fit_sky, derivatives, seen, weight, residual,
                    matrix, gradient):
     """Add what one box contributes to the normal equations of a group."""
     sky = 3 * n
@@ -196,11 +196,11 @@ def _add_equations(parameters, n, fit_sky, jets, seen, weight, residual,
             continue
         flux = parameters[3 * s]
         one = slice(3 * s, 3 * s + 3)
-        own = jets[s, :, :weight.size]
+        own = derivatives[s, :, :weight.size]
         _add_gradient(own, flux, weight, residual, gradient[one])
         for t in range(s + 1):
             if seen[t]:
-                _add_block(own, flux, jets[t, :, :weight.size],
+                _add_block(own, flux, derivatives[t, :, :weight.size],
                            parameters[3 * t], weight,
                            matrix[one, 3 * t:3 * t + 3])
         if fit_sky:
@@ -222,7 +222,7 @@ def _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
     Only the lower triangle of the matrix is filled.
     """
     boxes, data, variance, gain = pixels
-    jets, seen, _ = scratch
+    derivatives, seen, _ = scratch
     weights, residuals, matrix, gradient = new
     size = 3 * n + fit_sky
     matrix[:size, :size] = 0.0
@@ -235,8 +235,8 @@ def _normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
         _model_stars(parameters, n, boxes[c], psf, scratch, residual)
         _weigh(data[c, :used], variance[c, :used], sky, gain,
                old[0][c, :used], residual, weight, chi2)
-        _add_equations(parameters, n, fit_sky, jets, seen, weight, residual,
-                       matrix, gradient)
+        _add_equations(parameters, n, fit_sky, derivatives, seen, weight,
+                       residual, matrix, gradient)
 
 
 @inner
@@ -517,11 +517,11 @@ def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
 
 
 @kernel
-def star_jet(x_0, y_0, box, psf, out):
+def star_derivatives(x_0, y_0, box, psf, out):
     """Put the unit-flux PSF in a box, d/dx_0 and d/dy_0 into out (3, n)."""
     tiling = (np.empty(4 * LANES), np.empty(3 * LANES * box[3]),
               np.empty(4, np.int64), np.empty((3, 4)))
-    fill_jet(x_0, y_0, box, psf, tiling, out)
+    fill_derivatives(x_0, y_0, box, psf, tiling, out)
 
 
 @kernel

@@ -43,7 +43,7 @@ def strides(nodes, out):
 
 
 @loop
-def _walk_starts(a, dx, dy, p, s, q, pace, by_x, by_y, height, walk):
+def _walk_starts(a, dx, dy, p, s, q, stride, by_x, by_y, height, walk):
     """
     Put what a walk along the columns starts from into walk (4, _LANES) flat.
 
@@ -51,9 +51,9 @@ def _walk_starts(a, dx, dy, p, s, q, pace, by_x, by_y, height, walk):
     one, and the factors of the Gaussian in its derivative by x and, short of
     s times the former, by y. Rows from height on stay as they are. Returns
     whether anything is there. The values of the first column are a Gaussian
-    in y, walked outward from its peak. pace is as of `paces`.
+    in y, walked outward from its peak. stride is as of `strides`.
     """
-    t, grow, drop, _ = pace
+    t, grow, drop, _ = stride
     u = dx
     slope = q * dy - p * s * u
     top = min(max(int(np.rint(-slope / t)), 0), height - 1)
@@ -118,7 +118,7 @@ def _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height, width,
 
 
 @inner
-def add_gaussian(a, dx, dy, p, s, q, pace, by_x, by_y, integrated, height,
+def add_gaussian(a, dx, dy, p, s, q, stride, by_x, by_y, integrated, height,
                  width, walk, tile):
     """
     Add a Gaussian, its first pixel at (dx, dy) from the peak, to a tile.
@@ -133,9 +133,16 @@ def add_gaussian(a, dx, dy, p, s, q, pace, by_x, by_y, integrated, height,
     if integrated or steep:
         _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height,
                     width, tile)
-    elif _walk_starts(a, dx - s * dy, dy, p, s, q, pace, by_x, by_y, height,
+    elif _walk_starts(a, dx - s * dy, dy, p, s, q, stride, by_x, by_y, height,
                       walk):
-        _add_walk(p, s, pace[3], width, walk, tile)
+        _add_walk(p, s, stride[3], width, walk, tile)
+
+
+@inner
+def clear(values, n):
+    """Make the first n of values zero."""
+    for i in range(n):
+        values[i] = 0.0
 
 
 @inner
@@ -143,8 +150,8 @@ def _fill_tile(x_0, y_0, row, column, height, width, psf, tiling):
     """Put the PSF and its derivatives in up to _LANES rows into the tile."""
     nodes, strides, _, _, integrated = psf
     walk, tile, index, weights = tiling
-    walk[:] = 0.0
-    tile[:3 * LANES * width] = 0.0
+    clear(walk, walk.size)
+    clear(tile, 3 * LANES * width)
     for corner in range(4):
         w, wx, wy = weights[0, corner], weights[1, corner], weights[2, corner]
         if w == 0 and wx == 0 and wy == 0:
@@ -159,12 +166,12 @@ def _fill_tile(x_0, y_0, row, column, height, width, psf, tiling):
 
 
 @inner
-def fill_jet(x_0, y_0, box, psf, tiling, jet):
+def fill_derivatives(x_0, y_0, box, psf, tiling, out):
     """
     Put the unit-flux PSF in a box and its derivatives by x_0 and y_0.
 
-    They go into jet (3, width * height), column after column. psf is (nodes,
-    paces, x_grid, y_grid, integrated), tiling is scratch (walk, tile, index,
+    They go into out (3, width * height), column after column. psf is (nodes,
+    strides, x_grid, y_grid, integrated), tiling is scratch (walk, tile, index,
     weights). The change of the blend with position is included.
     """
     _, tile, index, weights = tiling
@@ -178,4 +185,4 @@ def fill_jet(x_0, y_0, box, psf, tiling, jet):
                 k = (3 * i + part) * LANES
                 to = i * height + bottom
                 for j in range(rows):
-                    jet[part, to + j] = tile[k + j]
+                    out[part, to + j] = tile[k + j]

@@ -224,20 +224,20 @@ def cramer_rao(psf, flux, sky=0, *, x=0, y=0, read_noise=0, gain=1,
                              read_noise=read_noise, gain=gain,
                              exposure_time=exposure_time)
     noise = level**2, _electrons(gain, exposure_time)
-    jets = _Jets(psf, x, y, as_shape(fit_shape, 'fit_shape'))
+    stars = _StarDerivatives(psf, x, y, as_shape(fit_shape, 'fit_shape'))
     if jointly:
-        return CramerRao(_joint_bound(jets, flux, noise, free_sky), unit)
+        return CramerRao(_joint_bound(stars, flux, noise, free_sky), unit)
     return CramerRao(np.array([
-        _bound(jets.own(i), flux[i], noise, free_sky)
+        _bound(stars.own(i), flux[i], noise, free_sky)
         for i in range(x.size)]), unit)
 
 
-class _Jets:
+class _StarDerivatives:
     """The PSF and its derivatives by position in the pixels of each star."""
 
     def __init__(self, psf, x, y, fit_shape):
         self.x, self.y = x, y
-        self.psf = _jet_arrays(psf)
+        self.psf = _kernel_arrays(psf)
         huge = (np.iinfo(np.int32).max, np.iinfo(np.int32).max)
         self.corner = np.floor([x.min(), y.min()]) - max(fit_shape)
         self.boxes = cut_boxes(x - self.corner[0], y - self.corner[1],
@@ -246,38 +246,38 @@ class _Jets:
         self.boxes[:, 1] += int(self.corner[0])
 
     def star(self, i, box):
-        """Return the jet (3, pixels) of star i in a box."""
+        """Return the derivatives (3, pixels) of star i in a box."""
         out = np.empty((3, box[2] * box[3]))
-        kernels.star_jet(self.x[i], self.y[i], box, self.psf, out)
+        kernels.star_derivatives(self.x[i], self.y[i], box, self.psf, out)
         return out
 
     def own(self, i):
         return self.star(i, self.boxes[i])
 
 
-def _jet_arrays(psf):
+def _kernel_arrays(psf):
     if isinstance(psf, GaussianMixture):
         psf = MultiGaussianPSFModel(psf)
     return psf_arrays(as_model(psf))
 
 
-def _bound(jet, flux, noise, free_sky):
+def _bound(derivatives, flux, noise, free_sky):
     """Return the covariance (3, 3) of one star by itself."""
-    columns = [jet[0], flux * jet[1], flux * jet[2]]
+    columns = [derivatives[0], flux * derivatives[1], flux * derivatives[2]]
     if free_sky:
-        columns.append(np.ones(jet.shape[1]))
+        columns.append(np.ones(derivatives.shape[1]))
     columns = np.array(columns)
-    variance = noise[0] + np.maximum(flux * jet[0], 0) / noise[1]
+    variance = noise[0] + np.maximum(flux * derivatives[0], 0) / noise[1]
     return _inverse_blocks((columns / variance) @ columns.T, 1)[0]
 
 
-def _joint_bound(jets, flux, noise, free_sky):
+def _joint_bound(stars, flux, noise, free_sky):
     """Return the covariances (n, 3, 3) of stars that share pixels."""
     n = flux.size
     size = 3 * n + bool(free_sky)
     fisher = np.zeros((size, size))
     seen = set()
-    for box in jets.boxes:
+    for box in stars.boxes:
         pixels = [(row, column)
                   for column in range(box[1], box[1] + box[3])
                   for row in range(box[0], box[0] + box[2])]
@@ -285,11 +285,12 @@ def _joint_bound(jets, flux, noise, free_sky):
         seen.update(pixels)
         if not new.any():
             continue
-        jet = np.array([jets.star(i, box)[:, new] for i in range(n)])
-        jet[:, 1:] *= flux[:, None, None]
+        derivatives = np.array([stars.star(i, box)[:, new]
+                                for i in range(n)])
+        derivatives[:, 1:] *= flux[:, None, None]
         variance = noise[0] + np.maximum(
-            flux @ jet[:, 0], 0) / noise[1]
-        columns = jet.reshape(3 * n, -1)
+            flux @ derivatives[:, 0], 0) / noise[1]
+        columns = derivatives.reshape(3 * n, -1)
         if free_sky:
             columns = np.vstack([columns, np.ones(columns.shape[1])])
         fisher += (columns / variance) @ columns.T

@@ -4,7 +4,8 @@ What a PSF is: mixtures of Gaussians, the astropy models, grids, shapes.
 `mixture` has `GaussianMixture`, a frozen value with its algebra; `model` and
 `gridded` are the two astropy models, drop-in for photutils, on what `base`
 has in common for them; `grid` is a detector grid as arrays, `local` the same
-at the places of many stars, `convert` what other programs call a PSF.
+at the places of many stars, `renderer` draws them on an image, `convert` is
+what other programs call a PSF.
 `shapes` measures sizes and ellipticities, `assessment` compares them with a
 truth. Nothing here fits an image: constructors that must fit call the room
 `fitting` when they are called.

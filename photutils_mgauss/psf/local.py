@@ -8,9 +8,10 @@ covariance of its family can stand for it, K Gaussians do.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from photutils_mgauss import kernels
+from photutils_mgauss.psf.base import PSFModel
+from photutils_mgauss.psf.grid import match
 from photutils_mgauss.psf.rows import kernel_rows
 
 MAX_WING = 60
@@ -68,6 +69,18 @@ class LocalPSF:
         return replace(psf, profile=_profile(stamp),
                        area=stamp.sum()**2 / (stamp**2).sum())
 
+    @classmethod
+    def of(cls, model):
+        """Return the PSF of a GriddedMixturePSF or MultiGaussianPSFModel."""
+        if not isinstance(model, PSFModel):
+            msg = ('psf_model must be a GriddedMixturePSF or a '
+                   f'MultiGaussianPSFModel, got {model!r:.80}')
+            raise TypeError(msg)
+        grid = model.grid
+        return cls.from_nodes(
+            grid.x_grid, grid.y_grid, grid.weights * grid.scales[:, None],
+            grid.means, grid.covariances, bool(model.pixel_integrated))
+
     @property
     def n_rows(self):
         """The largest number of Gaussians of a star."""
@@ -86,15 +99,11 @@ class LocalPSF:
                          j_next * n + i_next], axis=-1)
 
     def _join_families(self, j, i):
-        corners = self._corners(j, i)
-        features = np.concatenate([
-            self.weights[..., None], self.means,
-            self.covariances.reshape(*self.weights.shape, 4)], axis=-1)
-        first = features[corners[0]]
-        for c in range(1, 4):
-            other = features[corners[c]]
-            cost = ((first[:, None] - other) ** 2).sum(axis=-1)
-            self.order[j, i, c] = linear_sum_assignment(cost)[1]
+        stack = (self.weights, self.means, self.covariances)
+        first, *others = ([array[corner] for array in stack]
+                          for corner in self._corners(j, i))
+        for c, other in enumerate(others, 1):
+            self.order[j, i, c] = match(first, other)
         x, y = self._middle(j, i)
         exact = self._stamp(*self.rows_at(x, y))
         self.merged[j, i] = True
@@ -145,12 +154,12 @@ class LocalPSF:
                                      covariances[four]).reshape(-1, 4 * k, 6)
         return rows, count
 
-    @staticmethod
-    def paces(rows):
-        """Return what the kernels' walks over Gaussians need beside rows."""
-        out = np.empty((*rows.shape[:2], 4))
-        kernels.strides(rows, out)
-        return out
+    def gaussians_at(self, x, y):
+        """Return the PSFs of stars at positions (n,) for the kernels."""
+        rows, count = self.rows_at(x, y)
+        strides = np.empty((*rows.shape[:2], 4))
+        kernels.strides(rows, strides)
+        return kernels.Gaussians(rows, strides, count, self.integrated)
 
     def stamp(self, x, y, half):
         """Draw a star of unit flux in the middle of a stamp."""

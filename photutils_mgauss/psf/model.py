@@ -268,14 +268,15 @@ class MultiGaussianPSFModel(PSFModel):
         return [out[0], -flux * out[1], -flux * out[2]]
 
     def _all_derivatives(self, dx, dy, flux, shape, free):
-        jets = np.empty((self._n_components, 6, dx.size))
-        kernels.jets(dx, dy, shape.unit_rows, self._pixel_integrated, jets)
-        value, gx, gy = np.tensordot(shape.weights, jets[:, :3], 1)
+        derivatives = np.empty((self._n_components, 6, dx.size))
+        kernels.derivatives(dx, dy, shape.unit_rows, self._pixel_integrated,
+                            derivatives)
+        value, gx, gy = np.tensordot(shape.weights, derivatives[:, :3], 1)
         columns = [value, -flux * gx, -flux * gy]
-        columns += list(flux * shape.weight_slopes() @ jets[:, 0])
+        columns += list(flux * shape.weight_slopes() @ derivatives[:, 0])
         for k in range(self._n_components):
             first = len(columns)
-            columns += shape.derivatives(k, flux, jets[k]) if any(
+            columns += shape.derivatives(k, flux, derivatives[k]) if any(
                 free[first:first + 5]) else [value] * 5
         return columns
 
@@ -339,13 +340,13 @@ class _Shape:
                 left *= 1 - breaks[j]
         return slopes
 
-    def derivatives(self, k, flux, jet):
+    def derivatives(self, k, flux, unit):
         """
         Return the columns of the mean, stddevs and rho of Gaussian k.
 
         The derivatives by the covariance follow from the heat equation.
         """
-        _, gx, gy, gxx, gxy, gyy = flux * self.weights[k] * jet
+        _, gx, gy, gxx, gxy, gyy = flux * self.weights[k] * unit
         sx, sy = self.stddevs[k]
         rho = self.rho[k]
         sign_x, sign_y = np.sign(self.raw_stddevs[k])

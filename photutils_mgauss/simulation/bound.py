@@ -17,7 +17,7 @@ import numpy as np
 from astropy.table import QTable
 from astropy.time import Time
 
-from photutils_mgauss.simulation.renderer import brush_of
+from photutils_mgauss.simulation.renderer import renderer_of
 from photutils_mgauss.utils.parallel import map_chunks
 
 # Half the side of the stamps, and the step of the derivatives [pix].
@@ -74,17 +74,17 @@ def covariances(psf, x, y, flux, variance, executor):
 
     ``variance`` is that of a pixel without the star [electron^2].
     """
-    brush = brush_of(psf)
+    renderer = renderer_of(psf)
 
     def bounds(xs, ys, fluxes):
-        return [_bound(brush, *star, variance)
+        return [_bound(renderer, *star, variance)
                 for star in zip(xs, ys, fluxes, strict=True)]
     return np.array(map_chunks(bounds, (x, y, flux), executor,
                                chunk_size=64)).reshape(-1, 3, 3)
 
 
-def _bound(brush, x, y, flux, variance):
-    star, *derivatives = _derivatives(brush, x, y, flux)
+def _bound(renderer, x, y, flux, variance):
+    star, *derivatives = _derivatives(renderer, x, y, flux)
     weight = 1 / (variance + star)
     jacobian = np.stack(derivatives)
     fisher = np.einsum('iyx,jyx,yx->ij', jacobian, jacobian, weight)
@@ -94,18 +94,18 @@ def _bound(brush, x, y, flux, variance):
             * np.outer(scale, scale))
 
 
-def _derivatives(brush, x, y, flux):
+def _derivatives(renderer, x, y, flux):
     """Return the stamp of a star and its derivatives by x, y and flux."""
     h = _STEP
     moved = [(x, y), (x + h, y), (x - h, y), (x, y + h), (x, y - h)]
-    star, right, left, up, down = (_stamp(brush, *place, flux, x, y)
+    star, right, left, up, down = (_stamp(renderer, *place, flux, x, y)
                                    for place in moved)
     return star, (right - left) / (2 * h), (up - down) / (2 * h), star / flux
 
 
-def _stamp(brush, x, y, flux, x_centre, y_centre):
+def _stamp(renderer, x, y, flux, x_centre, y_centre):
     out = np.zeros((2 * _HALF + 1, 2 * _HALF + 1))
-    brush.add(np.array([[x], [y], [flux]]), 1e-5 * flux,
+    renderer.add(np.array([[x], [y], [flux]]), 1e-5 * flux,
               np.rint(x_centre) - _HALF, np.rint(y_centre) - _HALF, out)
     return out
 

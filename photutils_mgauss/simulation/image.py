@@ -20,7 +20,7 @@ from photutils_mgauss.simulation.effects import (
 )
 from photutils_mgauss.simulation.exposures import Exposure
 from photutils_mgauss.simulation.instrument import Instrument
-from photutils_mgauss.simulation.renderer import brush_of
+from photutils_mgauss.simulation.renderer import renderer_of
 from photutils_mgauss.utils.parallel import map_parallel
 
 # Rows that share a random stream. It is part of what a seed means.
@@ -33,11 +33,11 @@ FAINTEST = 1e-3
 
 def draw(psf, x, y, flux, shape, faintest, executor):
     """Return the light (ny, nx) of stars."""
-    bands, brush = row_bands(shape), brush_of(psf)
+    bands, renderer = row_bands(shape), renderer_of(psf)
     image = np.empty(shape)
     parts = map_parallel(
-        partial(_render, brush, shape[1], faintest), bands,
-        _split(brush, x, y, flux, bands, faintest), executor=executor)
+        partial(_render, renderer, shape[1], faintest), bands,
+        _split(renderer, x, y, flux, bands, faintest), executor=executor)
     for band, part in zip(bands, parts, strict=True):
         image[band] = part
     return image
@@ -50,13 +50,13 @@ def row_bands(shape):
             for start in range(0, ny, _BAND_ROWS)]
 
 
-def _split(brush, x, y, flux, bands, faintest):
+def _split(renderer, x, y, flux, bands, faintest):
     """Yield, for each band, the stars (3, n) that may reach it."""
     # By y, so that each band finds its stars, and the sum over stars in
     # each pixel has one order.
     order = np.argsort(y, kind='stable')
     stars = np.stack([x, y, flux])[:, order]
-    reach = brush.reach(stars[2], faintest)
+    reach = renderer.reach(stars[2], faintest)
     farthest = reach.max(initial=0)
     for band in bands:
         first, last = np.searchsorted(
@@ -67,10 +67,10 @@ def _split(brush, x, y, flux, bands, faintest):
         yield stars[:, near][:, distance <= reach[near]]
 
 
-def _render(brush, width, faintest, band, stars):
+def _render(renderer, width, faintest, band, stars):
     """Return the expected light (rows, width) of stars in a band of rows."""
     out = np.zeros((band.stop - band.start, width))
-    brush.add(stars, faintest, 0, band.start, out)
+    renderer.add(stars, faintest, 0, band.start, out)
     return out
 
 
@@ -101,13 +101,13 @@ class Chip:
 def expose(chip, truth, psf, rng, executor):
     """Return the electrons in each pixel, at most a full well, and flags."""
     x, y, flux = (truth[name].value for name in ('x', 'y', 'flux'))
-    brush = brush_of(psf)
+    renderer = renderer_of(psf)
     electrons = np.empty(chip.instrument.shape, np.float32)
     flags = np.empty(chip.instrument.shape, np.uint8)
     repel = chip.effects.brighter_fatter
-    stars = _split(brush, x, y, 0 * flux if repel else flux, chip.bands,
+    stars = _split(renderer, x, y, 0 * flux if repel else flux, chip.bands,
                    FAINTEST)
-    parts = map_parallel(partial(_expose_band, chip, brush), chip.bands,
+    parts = map_parallel(partial(_expose_band, chip, renderer), chip.bands,
                          stars, rng.spawn(len(chip.bands)), executor=executor)
     for band, part in zip(chip.bands, parts, strict=True):
         electrons[band], flags[band] = part
@@ -124,10 +124,10 @@ def expose(chip, truth, psf, rng, executor):
     return electrons, flags
 
 
-def _expose_band(chip, brush, band, stars, rng):
+def _expose_band(chip, renderer, band, stars, rng):
     """Return the electrons and flags of a band of rows."""
     instrument, fixed = chip.instrument, chip.pattern(band)
-    expected = _render(brush, instrument.shape[1], FAINTEST, band, stars)
+    expected = _render(renderer, instrument.shape[1], FAINTEST, band, stars)
     expected += chip.sky
     expected *= fixed.response
     expected += instrument.dark_level

@@ -1,8 +1,7 @@
 """
 What draws stars: mixtures on a grid, or images of effective PSFs on one.
 
-A brush adds stars to an image whose first pixel is the detector's (left,
-bottom), and knows how far from a star it paints.
+The renderer of images does what `psf.renderer.MixtureRenderer` does.
 """
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,48 +13,11 @@ from scipy.ndimage import gaussian_filter, spline_filter
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
+from photutils_mgauss.psf.renderer import MixtureRenderer
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureBrush:
-    """Stars made of Gaussians."""
-
-    psf: GriddedMixturePSF
-
-    @property
-    def peak(self):
-        """The brightest pixel of any star of flux 1."""
-        integrated = self.psf.pixel_integrated
-        return max(float(m.evaluate(0, 0, pixel_integrated=integrated))
-                   for m in self.psf.mixtures)
-
-    def reach(self, flux, faintest):
-        """Return how far a star of each flux is drawn (n,) [pix]."""
-        rows = self.psf._grid.rows
-        peak = np.abs(rows[..., 0]).max(axis=0)
-        stddev = 1 / np.sqrt(rows[..., 5].min(axis=0))
-        offset = np.abs(rows[..., 2]).max()
-        reach = np.zeros_like(flux)
-        for height, sigma in zip(peak, stddev, strict=True):
-            ratio = np.maximum(np.abs(flux) * height / faintest,
-                               1 / kernels.DEPTH)
-            reach = np.maximum(reach, sigma * np.sqrt(2 * np.log(ratio)))
-        return reach + offset + 1
-
-    def add(self, stars, faintest, left, bottom, out):
-        """Add stars (3, n), the rows x, y and flux, to out (ny, nx)."""
-        x, y, flux = np.ascontiguousarray(stars)
-        grid = self.psf._grid
-        kernel, nodes = ((kernels.render_image, grid.rows)
-                         if self.psf.interpolation == 'blend' else
-                         (kernels.render_matched_image, grid.sums))
-        kernel(x, y, flux, nodes, grid.x_grid, grid.y_grid,
-               self.psf.pixel_integrated, float(faintest), float(left),
-               float(bottom), out)
-
-
-@dataclass(frozen=True, eq=False)
-class ImageBrush:
+class ImageRenderer:
     """Stars interpolated in the ePSF images of a photutils grid."""
 
     psf: GriddedPSFModel
@@ -118,12 +80,12 @@ class ImageBrush:
                              float(left), float(bottom), out)
 
 
-def brush_of(psf):
+def renderer_of(psf):
     """Return what draws stars with a PSF."""
     if isinstance(psf, GriddedMixturePSF):
-        return MixtureBrush(psf)
+        return MixtureRenderer(psf)
     if isinstance(psf, GriddedPSFModel):
-        return ImageBrush(psf)
+        return ImageRenderer(psf)
     msg = ('psf must be a GriddedMixturePSF or a GriddedPSFModel, got '
            f'{type(psf).__name__}')
     raise TypeError(msg)

@@ -26,7 +26,7 @@ from photutils_mgauss.simulation.exposures import Exposure
 from photutils_mgauss.simulation.image import Chip, draw, expose, read
 from photutils_mgauss.simulation.instrument import Instrument
 from photutils_mgauss.simulation.mock_psf import csst_psf
-from photutils_mgauss.simulation.renderer import brush_of, widen
+from photutils_mgauss.simulation.renderer import renderer_of, widen
 from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
 
 __all__ = ['Scene', 'render_stars', 'simulate', 'simulate_catalogues',
@@ -318,7 +318,7 @@ def _catalogue(sources, exposure, instrument, psf, threshold, rng, executor):
     truth = _truth(sources, exposure, instrument, wcs)
     sky = instrument.sky(exposure.band)
     flux = truth['flux'].value
-    peak = brush_of(psf).peak
+    peak = renderer_of(psf).peak
     truth = truth[truth['inside'] & (flux > 0)
                   & (flux * peak + sky < instrument.full_well)]
     bounds = covariances(

@@ -10,7 +10,7 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
 from photutils_mgauss import GriddedMixturePSF, fit_mixture_field, kernels
-from photutils_mgauss.crowded.photometry import _local_psf
+from photutils_mgauss.psf.local import LocalPSF
 
 EDGES = np.arange(17, 26)
 MARGIN = 12
@@ -96,20 +96,19 @@ def make_psf(folder, origin, n_components, radius):
 def bounds(psf, truth, variance):
     """Return the Cramer-Rao bound of each star's x and y, (n, 2)."""
     x, y, flux = (np.array(truth[c], float) for c in ('x', 'y', 'flux'))
-    local, half = _local_psf(psf), 9
-    rows, count = local.rows_at(x, y)
+    half = 9
     n, width = x.size, 2 * half + 1
-    place = (np.rint(x).astype(np.int64) - half,
-             np.rint(y).astype(np.int64) - half,
-             np.full(n, width), np.arange(n) * width**2)
-    jets = np.empty((3, n * width**2))
-    kernels.star_stamps(np.arange(n), x, y, *place, rows,
-                        local.paces(rows), count, local.integrated, jets)
-    fisher = np.empty((n, 3, 3))
-    kernels.own_equations(flux, *place, jets, 1 / variance,
-                          np.zeros(variance.shape), fisher,
-                          np.empty((n, 3)), np.empty((n, 3)))
-    diagonal = np.diagonal(np.linalg.inv(fisher), axis1=1, axis2=2)
+    stamps = kernels.Stamps(
+        np.rint(x).astype(np.int64) - half, np.rint(y).astype(np.int64) - half,
+        np.full(n, width), np.arange(n) * width**2,
+        np.empty((3, n * width**2)))
+    kernels.star_stamps(np.arange(n), kernels.Sources(x, y, flux), stamps,
+                        LocalPSF.of(psf).gaussians_at(x, y))
+    equations = kernels.StarEquations(np.empty((n, 3, 3)), np.empty((n, 3)),
+                                      np.empty((n, 3)), np.empty((0, 3, 3)))
+    kernels.own_equations(flux, stamps, 1 / variance,
+                          np.zeros(variance.shape), equations)
+    diagonal = np.diagonal(np.linalg.inv(equations.matrix), axis1=1, axis2=2)
     return np.sqrt(diagonal[:, 1:])
 
 

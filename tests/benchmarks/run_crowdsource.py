@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF, kernels
-from photutils_mgauss.crowded.photometry import _local_psf
+from photutils_mgauss.psf.local import LocalPSF
 
 RADIUS = 24
 
@@ -23,7 +23,7 @@ class CallablePSF:
     def __init__(self, weights, means, covariances, grid):
         mixtures = [GaussianMixture(*m) for m in
                     zip(weights, means, covariances, strict=True)]
-        self.psf = _local_psf(GriddedMixturePSF(mixtures, grid))
+        self.psf = LocalPSF.of(GriddedMixturePSF(mixtures, grid))
 
     def __call__(self, x, y, stampsz=None, deriv=False):
         size = int(stampsz or 2 * RADIUS + 1)
@@ -38,16 +38,15 @@ class CallablePSF:
         return tuple(out) if deriv else out[0]
 
     def _stamps(self, x, y, half):
-        rows, count = self.psf.rows_at(x, y)
         n, width = x.size, 2 * half + 1
         # crowdsource centres stamps on the pixel numpy.round names.
         left, bottom = (np.round(v).astype(np.int64) - half for v in (x, y))
-        jets = np.empty((3, n * width**2))
-        kernels.star_stamps(np.arange(n), x, y, left, bottom,
-                            np.full(n, width), np.arange(n) * width**2,
-                            rows, self.psf.paces(rows), count,
-                            self.psf.integrated, jets)
-        return jets.reshape(3, n, width, width)
+        stamps = kernels.Stamps(left, bottom, np.full(n, width),
+                                np.arange(n) * width**2,
+                                np.empty((3, n * width**2)))
+        kernels.star_stamps(np.arange(n), kernels.Sources(x, y, np.ones(n)),
+                            stamps, self.psf.gaussians_at(x, y))
+        return stamps.derivatives.reshape(3, n, width, width)
 
     def render_model(self, x, y, stampsz=None):
         """Return stamps at whole pixels."""

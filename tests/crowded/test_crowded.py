@@ -86,39 +86,39 @@ def small_tile(x, y, flux, noise=1.0):
 
 def test_stamps_hold_the_psf_and_its_derivatives():
     tile = small_tile([], [], [])
-    tile.stars = Stars([12.3], [14.6], [1.0], n_rows=tile.psf.n_rows)
-    tile.refresh()
-    w = tile.width[0]
-    jets = tile.jets.reshape(3, w, w)
+    tile.start(Stars([12.3], [14.6], [1.0]))
+    stamps = tile.model.stamps
+    w = stamps.width[0]
+    derivatives = stamps.derivatives.reshape(3, w, w)
     model = MultiGaussianPSFModel(MIXTURE)
     j, i = np.indices((w, w))
-    exact = model.fit_deriv(i + tile.left[0], j + tile.bottom[0], 1, 12.3,
-                            14.6, *model.parameters[3:])[:3]
-    assert_allclose(jets, exact, atol=1e-14)
+    exact = model.fit_deriv(i + stamps.left[0], j + stamps.bottom[0], 1,
+                            12.3, 14.6, *model.parameters[3:])[:3]
+    assert_allclose(derivatives, exact, atol=1e-14)
 
 
 def test_the_joint_normal_matrix_is_that_of_the_dense_problem():
     x, y, flux = [12.3, 14.1, 15.2], [14.6, 15.4, 13.2], [900., 500., 300.]
     tile = small_tile(x, y, flux)
-    tile.stars = Stars(x, y, flux, n_rows=tile.psf.n_rows)
-    tile.refresh()
+    tile.start(Stars(x, y, flux))
+    stamps = tile.model.stamps
     columns = []
     for k in range(3):
-        w = tile.width[k]
-        stamp = tile.jets[:, tile.offset[k]:tile.offset[k] + w * w]
+        w, first = stamps.width[k], stamps.offset[k]
+        stamp = stamps.derivatives[:, first:first + w * w]
         for m, scale in enumerate((1, flux[k], flux[k])):
-            plane = np.zeros(tile.data.shape)
-            plane[tile.bottom[k]:tile.bottom[k] + w,
-                  tile.left[k]:tile.left[k] + w] = scale * stamp[m].reshape(
-                      w, w)
+            plane = np.zeros(tile.model.data.shape)
+            plane[stamps.bottom[k]:stamps.bottom[k] + w,
+                  stamps.left[k]:stamps.left[k] + w] = (
+                      scale * stamp[m].reshape(w, w))
             columns.append(plane.ravel())
     design = np.array(columns)
     dense = np.linalg.inv(design @ design.T)
-    covariance, correlation = tile.covariances()
+    covariance, correlation = tile.equations.covariances()
     for k in range(3):
         block = slice(3 * k, 3 * k + 3)
         assert_allclose(covariance[k], dense[block, block], rtol=1e-9)
-        other = 3 * tile.pairs.nearest[k]
+        other = 3 * tile.equations.neighbours.nearest[k]
         want = dense[3 * k, other] / np.sqrt(dense[3 * k, 3 * k]
                                              * dense[other, other])
         assert_allclose(correlation[k], want, rtol=1e-9)
@@ -128,13 +128,12 @@ def test_gauss_newton_finds_a_noiseless_blend_again():
     x, y = np.array([12.3, 13.5, 15.2]), np.array([14.6, 15.3, 13.2])
     flux = np.array([9000.0, 5000.0, 300.0])
     tile = small_tile(x, y, flux)
-    tile.stars = Stars(x + 0.15, y - 0.1, 0.8 * flux, n_rows=tile.psf.n_rows)
-    tile.refresh()
+    tile.start(Stars(x + 0.15, y - 0.1, 0.8 * flux))
     for _ in range(40):
         tile.step()
-    assert_allclose(tile.stars.x, x, atol=2e-3)
-    assert_allclose(tile.stars.flux, flux, rtol=2e-3)
-    assert_allclose(tile.level, 5, atol=0.02)
+    assert_allclose(tile.model.stars.x, x, atol=2e-3)
+    assert_allclose(tile.model.stars.flux, flux, rtol=2e-3)
+    assert_allclose(tile.model.level, 5, atol=0.02)
 
 
 def test_the_background_of_a_plane_is_that_plane():
@@ -290,6 +289,36 @@ def test_the_residual_image_is_noise(crowd):
     residual = phot.make_residual_image(data, include_local_bkg=True)
     chi = (residual / error)[12:-12, 12:-12]
     assert 1.4826 * np.median(np.abs(chi)) < 1.15
+
+
+def wide_winged():
+    """Return photometry of a bright star with wide wings, and its truth."""
+    mixture = GaussianMixture([0.9, 0.1], np.zeros((2, 2)),
+                              [np.eye(2), 144 * np.eye(2)])
+    y, x = np.indices((111, 111))
+    true = 1e7 * mixture.evaluate(x - 55, y - 55)
+    error = np.sqrt(true + 100)
+    phot = CrowdedMixturePhotometry(GriddedMixturePSF([mixture], [(0, 0)]),
+                                    background_size=None)
+    phot(true, error=error)
+    return phot, true
+
+
+def test_the_model_image_has_all_of_the_wings_that_can_be_seen():
+    phot, true = wide_winged()
+    model = phot.make_model_image(true.shape)
+    assert true[55, 86] == pytest.approx(39.3, abs=0.1)
+    # A hundredth of the noise.
+    assert_allclose(model, true, rtol=1e-3, atol=0.1)
+
+
+def test_the_model_image_has_no_more_of_a_star_than_is_asked_for():
+    phot, true = wide_winged()
+    model = phot.make_model_image(true.shape, psf_shape=(9, 21))
+    inside = np.zeros(true.shape, bool)
+    inside[51:60, 45:66] = True
+    assert_allclose(model[inside], true[inside], rtol=1e-3)
+    assert not model[~inside].any()
 
 
 def test_given_positions_are_fitted_in_their_order(crowd):
@@ -654,10 +683,12 @@ def test_the_solution_of_conjugate_gradients_solves_the_equations():
     full[:15, 15:] = np.repeat(reach.ravel()[:, None] / 4, 4, axis=1)
     full[15:, :15] = full[:15, 15:].T
     right = rng.normal(size=3 * n + 4)
-    step, level = np.empty((n, 3)), np.empty(4)
+    step, level = np.zeros((n, 3)), np.zeros(4)
     kernels.solve_joint(
-        matrix, right[:15].reshape(n, 3).copy(), indptr, j.astype(np.int64),
-        blocks, node, share, reach, np.diag(full)[15:].copy(), 0.7, 2,
-        right[15:].copy(), 1e-12, 200, step, level)
+        kernels.StarEquations(matrix, right[:15].reshape(n, 3).copy(), reach,
+                              blocks),
+        kernels.Pairs(indptr, j.astype(np.int64), np.empty(0, np.int64)),
+        kernels.MeshEquations(np.diag(full)[15:].copy(), right[15:].copy(),
+                              0.7, 2, node, share), 1e-12, 200, step, level)
     assert_allclose(np.concatenate([step.ravel(), level]),
                     np.linalg.solve(full, right), rtol=1e-6)

@@ -1,0 +1,138 @@
+"""
+The joint normal equations of the stars and the background of a tile.
+
+Gauss-Newton steps for all parameters at once come from them, sparse because a
+star overlaps only its neighbours.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+
+from photutils_mgauss import kernels
+from photutils_mgauss.crowded.stars import Neighbours
+
+# A step of Gauss-Newton moves a star no further than this [pix].
+_MAX_MOVE = 0.4
+# Nor does it change a flux by more than these factors.
+_LEAST_CHANGE, _MOST_CHANGE = 0.2, 2.5
+# Joint equations are solved until the residual is this fraction of what it
+# was: what is left over would depend on what else is on the tile.
+_TOLERANCE = 1e-6
+_CG_STEPS = 400
+# What is known beforehand moves no flux by more standard errors than this.
+_STRONGEST_PULL = 0.5
+# Pixels further than this from the model take no part in the background.
+_BACKGROUND_CLIP = 4.0
+
+
+@dataclass(frozen=True)
+class Equations:
+    """
+    The normal equations of a model as it was when they were formed.
+
+    Parameters are ordered flux, x, y.
+    """
+
+    stars: kernels.StarEquations
+    mesh: kernels.MeshEquations
+    neighbours: Neighbours
+
+    @classmethod
+    def of(cls, model):
+        """Form the equations of a `Model`."""
+        stars = _star_equations(model)
+        _hold(stars, model.stars)
+        _expect(stars, model.stars, model.options.count_slope)
+        return cls(stars, _mesh_equations(model, stars), model.neighbours)
+
+    def solve(self, damping):
+        """Return the Gauss-Newton steps of the stars (n, 3) and the level."""
+        stars = self.stars._replace(
+            matrix=self.stars.matrix * (1 + damping * np.eye(3)))
+        step = np.zeros(self.stars.gradient.shape)
+        level_step = np.zeros(self.mesh.gradient.shape)
+        kernels.solve_joint(stars, self.neighbours.pairs, self.mesh,
+                            _TOLERANCE, _CG_STEPS, step, level_step)
+        return step, level_step
+
+    def covariances(self):
+        """Return covariances with neighbours free, and correlations."""
+        n = len(self.stars.matrix)
+        covariance, correlation = np.empty((n, 3, 3)), np.empty(n)
+        kernels.joint_covariances(self.stars, self.neighbours.pairs,
+                                  self.neighbours.nearest, covariance,
+                                  correlation)
+        return covariance, correlation
+
+
+def limited(step, stars):
+    """Return a step (n, 3) no longer than stars may go at once."""
+    out = np.empty_like(step)
+    out[:, 0] = np.clip(step[:, 0], (_LEAST_CHANGE - 1) * stars.flux,
+                        (_MOST_CHANGE - 1) * stars.flux)
+    for k, drift in enumerate(stars.drift, 1):
+        move = np.clip(step[:, k], -_MAX_MOVE, _MAX_MOVE)
+        out[:, k] = np.where(np.isfinite(stars.bound), np.clip(
+            move, -stars.bound - drift, stars.bound - drift), move)
+    return out
+
+
+def _star_equations(model):
+    n = len(model.stars)
+    pairs = model.neighbours.pairs
+    equations = kernels.StarEquations(
+        np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)),
+        np.empty((pairs.neighbour.size, 3, 3)))
+    flux = model.stars.flux
+    kernels.own_equations(flux, model.stamps, model.weight, model.residual,
+                          equations)
+    kernels.pair_blocks(flux, model.stamps, pairs, model.weight,
+                        equations.blocks)
+    return equations
+
+
+def _hold(equations, stars):
+    """Add what is known of the places of some stars."""
+    equations.matrix[:, [1, 2], [1, 2]] += stars.hold[:, None]
+    equations.gradient[:, 1:] -= (stars.hold * stars.drift).T
+
+
+def _expect(equations, stars, count_slope):
+    """Add what is known of the fluxes of found stars."""
+    # The logarithm of flux**-slope; less than half a standard error, lest
+    # it drive out what may be real.
+    own = np.maximum(equations.matrix[:, 0, 0], 0)
+    pull = np.minimum(count_slope / np.maximum(stars.flux, 1e-300),
+                      _STRONGEST_PULL * np.sqrt(own))
+    equations.gradient[:, 0] -= np.where(stars.hold > 0, 0, pull)
+
+
+def _mesh_equations(model, stars):
+    """Form the equations of the nodes' levels."""
+    mesh = model.mesh
+    if model.options.background_size:
+        # All pixels count for the information: stars are coupled through
+        # all of theirs. Those far from the model say nothing of the sky.
+        information, seen, total = mesh.sums(
+            model.weight, model.residual, model.background(),
+            _BACKGROUND_CLIP)
+        gradient = total - seen * model.level
+    else:
+        stars.coupling[:] = 0
+        information = gradient = np.zeros(model.level.size)
+    # Nodes without pixels follow their neighbours.
+    tie = float(mesh.tie / model.noise**2)
+    return kernels.MeshEquations(
+        information + tie * mesh.n_ties(),
+        gradient - tie * mesh.steepness(model.level), tie, mesh.shape[1],
+        *_own_node(mesh, model.stars))
+
+
+def _own_node(mesh, stars):
+    """Return the shares of a background that is constant in cells."""
+    # Only such a one makes, with each node's own mean, a matrix that is
+    # positive definite; where steps end does not depend on it.
+    node, share = mesh.shares(stars.x, stars.y)
+    own = np.zeros(share.shape)
+    own[np.arange(len(own)), share.argmax(axis=1)] = 1
+    return node, own

@@ -1,0 +1,202 @@
+r"""
+The model of one tile of a crowded image: stars on a background.
+
+The image is modelled as stars of unknown positions and fluxes on a bilinear
+background,
+
+.. math::
+
+    M(\mathbf{r}) = b(\mathbf{r}) + \sum_i f_i\,
+    P(\mathbf{r} - \mathbf{r}_i\,|\,\mathbf{r}_i).
+
+Positions here are tile pixels.
+"""
+import numpy as np
+
+from photutils_mgauss import kernels
+from photutils_mgauss.crowded.background import Mesh
+from photutils_mgauss.crowded.stars import Neighbours, Stars
+from photutils_mgauss.psf.local import MAX_WING
+
+# Fit stamps are 7 or 9 pixels wide, 13 for bright stars: almost all of the
+# information on a position lies in the core.
+_MIN_HALF, _MAX_HALF, _BRIGHT_HALF = 3, 4, 6
+# In units of noise over the PSF's peak.
+_BRIGHT_FLUX = 300
+# A star is drawn out to where its surface brightness falls below this
+# fraction of the noise.
+_WING_NOISE = 0.2
+# Of a star drawn afresh, Gaussians are left out where they fall below this
+# fraction of the noise.
+_FAINTEST = 1e-3
+
+
+class Model:
+    """
+    Stars and background of a tile, up to date with its residual and weights.
+
+    Only the methods here change its attributes.
+
+    Parameters
+    ----------
+    job : TileJob
+
+    Attributes
+    ----------
+    stars : Stars
+    level : (m,) `~numpy.ndarray`
+        The background at the nodes of ``mesh``.
+    residual, weight : (ny, nx) `~numpy.ndarray`
+        What the model leaves of the data, and inverse variances.
+    stamps, gaussians : kernels.Stamps, kernels.Gaussians
+        Each star's pixels and PSF.
+    wing : (n,) `~numpy.ndarray` of int
+        How far from its middle pixel each star is drawn [pix].
+    neighbours : Neighbours
+    """
+
+    def __init__(self, job):
+        self.data = job.data
+        self.variance = job.variance
+        self.good = job.variance > 0
+        self.psf = job.psf
+        self.options = job.options
+        self.noise = job.options.noise
+        self.weight = np.divide(1, self.variance, where=self.good,
+                                out=np.zeros(self.data.shape))
+        self._make_mesh(job.origin)
+        self._put(Stars([], [], []))
+
+    def _make_mesh(self, origin):
+        size = self.options.background_size
+        self.mesh = Mesh(self.data.shape, origin,
+                         size or max(self.data.shape))
+        # Stars hide the sky.
+        self.level = (self.mesh.faint_level(self.data, self.good) if size
+                      else np.zeros(self.mesh.size))
+        self.limits = (self.mesh.limits(self.data, self.good, self.noise)
+                       if size else (-np.inf, np.inf))
+
+    def _put(self, stars):
+        self.stars = stars
+        self.gaussians = self.psf.gaussians_at(np.empty(0), np.empty(0))
+
+    def start(self, stars):
+        """Put stars in place of all others."""
+        self._put(stars)
+        self.refresh()
+
+    def refresh(self):
+        """Choose stamps and wings, list neighbours, and draw everything."""
+        everyone = np.arange(len(self.stars))
+        self.wing, self.stamps = self._frames(everyone, 0)
+        self.neighbours = Neighbours.of(self.stars.x, self.stars.y)
+        self._localise_psf()
+        self._draw_stamps(everyone)
+        self.residual = self.data - self.background()
+        self._add_stars(everyone, -1.0)
+        self._weigh()
+
+    def _frames(self, chosen, start):
+        """Return wings and stamps, from start on, of the chosen stars."""
+        s = self.stars
+        flux = np.maximum(s.flux[chosen], 1e-300)
+        profile = self.psf.profile
+        wing = np.clip(
+            np.searchsorted(-profile, -_WING_NOISE * self.noise / flux),
+            _MIN_HALF, MAX_WING)
+        bright = flux * profile[0] > _BRIGHT_FLUX * self.noise
+        half = np.clip(wing, _MIN_HALF, np.where(
+            bright, _BRIGHT_HALF, _MAX_HALF))
+        half[s.seeded[chosen]] = _BRIGHT_HALF + 2
+        width = 2 * half + 1
+        ends = np.concatenate([[0], np.cumsum(width**2)]).astype(np.int64)
+        return np.maximum(wing, half).astype(np.int64), kernels.Stamps(
+            np.rint(s.x[chosen]).astype(np.int64) - half,
+            np.rint(s.y[chosen]).astype(np.int64) - half, width,
+            start + ends[:-1], np.empty((3, ends[-1])))
+
+    def admit(self, found):
+        """Add stars; the others stay as they are."""
+        new = np.arange(len(self.stars), len(self.stars) + len(found))
+        self.stars = Stars.joined([self.stars, found])
+        wing, stamps = self._frames(new, self.stamps.derivatives.shape[1])
+        self.wing = np.concatenate([self.wing, wing])
+        self.stamps = kernels.Stamps(*(
+            np.concatenate(parts, axis=-1)
+            for parts in zip(self.stamps, stamps, strict=True)))
+        self._localise_psf()
+        self._draw_stamps(new)
+        self._add_stars(new, -1.0)
+        self._reconnect()
+
+    def dismiss(self, gone):
+        """Take stars away; the others stay as they are."""
+        self._add_stars(np.flatnonzero(gone), 1.0)
+        self.stars = self.stars.chosen(~gone)
+        self.wing = self.wing[~gone]
+        *frame, derivatives = self.stamps
+        self.stamps = kernels.Stamps(*(part[~gone] for part in frame),
+                                     derivatives)
+        *rows, integrated = self.gaussians
+        self.gaussians = kernels.Gaussians(*(part[~gone] for part in rows),
+                                           integrated)
+        self._reconnect()
+
+    def _reconnect(self):
+        self._weigh()
+        self.neighbours = Neighbours.of(self.stars.x, self.stars.y)
+
+    def take(self, step, level_step):
+        """Change the stars by a step (n, 3), and the level; draw nothing."""
+        self.stars.take(step)
+        # A PSF that is much too wide would have the sky run away.
+        self.level = np.clip(self.level + level_step, *self.limits)
+
+    def take_in_place(self, step, level_step, changed):
+        """Take a step that changes some stars only; stamps stay in place."""
+        self._add_stars(changed, 1.0)
+        before = self.background()
+        self.take(step, level_step)
+        self._draw_stamps(changed)
+        self.residual += before - self.background()
+        self._add_stars(changed, -1.0)
+        self._weigh()
+
+    def _draw_stamps(self, chosen):
+        kernels.star_stamps(chosen, self.stars.sources, self.stamps,
+                            self.gaussians)
+
+    def _add_stars(self, chosen, sign):
+        kernels.add_stars(chosen, sign, self.stars.sources, self.stamps,
+                          self.wing, self.gaussians, _FAINTEST * self.noise,
+                          self.residual)
+
+    def background(self):
+        """Return the image of the background."""
+        return self.mesh.image(self.level)
+
+    def star_light(self):
+        """Return the image of the stars alone."""
+        return self.data - self.residual - self.background()
+
+    def _weigh(self):
+        if self.options.gain is not None:
+            # The photon noise of the model, not that of the data.
+            variance = self.variance - self.residual / self.options.gain
+            variance = np.maximum(variance, self.options.floor)
+            np.divide(1, variance, where=self.good, out=self.weight)
+
+    def _localise_psf(self):
+        """Find the PSF of stars that have none yet, the last ones."""
+        s, known = self.stars, self.gaussians.count.size
+        if known == len(s):
+            return
+        new = self.psf.gaussians_at(s.x[known:], s.y[known:])
+        *parts, integrated = zip(self.gaussians, new, strict=True)
+        self.gaussians = kernels.Gaussians(
+            *(np.concatenate(part) for part in parts), integrated[0])
+
+    def planes(self, light):
+        """Return weights, residual and an image as the kernels take them."""
+        return kernels.Planes(self.weight, self.residual, light)
