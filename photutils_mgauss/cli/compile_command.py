@@ -2,8 +2,6 @@
 import time
 import warnings
 
-import numpy as np
-
 from photutils_mgauss.cli import tools
 
 
@@ -67,12 +65,14 @@ def examples():
 
 def _scene(package):
     """Return a PSF, and 16 stars of it with noise."""
+    import numpy as np
+    from astropy.table import QTable
+
     mixture = package.GaussianMixture.from_stddevs(
         [0.8, 0.2], np.zeros((2, 2)), [(1.2, 1.1), (2, 2.1)], [0.1, 0])
     corners = [(0, 0), (99, 0), (0, 99), (99, 99)]
     psf = package.GriddedMixturePSF([mixture] * 4, corners)
     y, x = np.mgrid[20:100:20, 20:100:20].reshape(2, -1)
-    from astropy.table import QTable
     stars = QTable({'x_0': x + 0.3, 'y_0': y - 0.2,
                     'flux': np.full(x.size, 5e4)})
     data = package.render_stars(psf, x + 0.3, y - 0.2, stars['flux'],
@@ -83,7 +83,9 @@ def _scene(package):
 
 
 def _use_models(package, psf, integrated, data, error):
-    """Evaluate all models, and fit with photutils and in many images."""
+    """Evaluate all models, and fit with photutils."""
+    import numpy as np
+    from astropy.table import QTable
     from photutils.psf import PSFPhotometry
 
     y, x = np.mgrid[:9, :9]
@@ -97,7 +99,6 @@ def _use_models(package, psf, integrated, data, error):
         grid.render([3.2], [4.1], 100, 9)
     psf.mixtures[0].gradient(x, y)
     psf.mixtures[0].render((9, 9), 4, 4)
-    from astropy.table import QTable
     PSFPhotometry(psf, (5, 5), fitter=package.MixtureFitter(),
                   aperture_radius=3)(
         data, error=error,

@@ -39,7 +39,8 @@ COLUMNS = {
 
 def find_column(table, key):
     """Return the name of the column that holds ``key``, or None."""
-    return star_columns.find_column(table, COLUMNS[key])
+    return next((name for name in COLUMNS[key] if name in table.colnames),
+                None)
 
 
 @dataclass(frozen=True, eq=False)
