@@ -25,8 +25,13 @@ def _cell(position, grid):
     """
     if grid.size == 1:
         return 0, 0.0, 0.0
-    i = np.searchsorted(grid, position, side='right') - 1
-    i = min(max(i, 0), grid.size - 2)
+    i, beyond = 0, grid.size - 1
+    while beyond - i > 1:
+        middle = (i + beyond) // 2
+        if grid[middle] <= position:
+            i = middle
+        else:
+            beyond = middle
     width = grid[i + 1] - grid[i]
     fraction = (position - grid[i]) / width
     if fraction < 0:

@@ -59,7 +59,9 @@ def _solve_subset(gram, rhs, active, x, work):
         work[count, n] = rhs[i]
         count += 1
     _factor(work, count)
-    solution = work[:count, n].copy()
+    solution = np.empty(count)
+    for i in range(count):
+        solution[i] = work[i, n]
     _solve_factored(work, count, solution)
     count = 0
     for i in range(n):
@@ -67,6 +69,16 @@ def _solve_subset(gram, rhs, active, x, work):
         if active[i]:
             x[i] = solution[count]
             count += 1
+
+
+@inner
+def _lowest(x):
+    """Return the index of the smallest number."""
+    worst = 0
+    for i in range(1, x.size):
+        if x[i] < x[worst]:
+            worst = i
+    return worst
 
 
 @inner
@@ -93,12 +105,13 @@ def _solve_fluxes(gram, rhs, signed, x, active, work):
     all unknowns free. work is (n, n + 1).
     """
     n = rhs.size
-    active[:] = True
+    for i in range(n):
+        active[i] = True
     _solve_subset(gram, rhs, active, x, work)
     if signed:
         return
     for _ in range(3 * n):
-        worst = np.argmin(x)
+        worst = _lowest(x)
         if x[worst] < 0:
             active[worst] = False
             _solve_subset(gram, rhs, active, x, work)
@@ -270,3 +283,21 @@ def _factor_inverse_columns(a, n, first, count, out):
             for k in range(i + 1, n):
                 total -= a[k, i] * out[k, c]
             out[i, c] = total / a[i, i]
+
+
+# Plain loops: the same as a statement about whole arrays, with its check of
+# shapes, takes seconds to compile.
+
+@inner
+def copy_vector(source, n, target):
+    """Copy the first n numbers."""
+    for i in range(n):
+        target[i] = source[i]
+
+
+@inner
+def copy_matrix(source, n_rows, n_columns, target):
+    """Copy the first rows and columns."""
+    for i in range(n_rows):
+        for j in range(n_columns):
+            target[i, j] = source[i, j]

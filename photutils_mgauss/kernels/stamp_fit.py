@@ -8,6 +8,8 @@ from photutils_mgauss.kernels.linear import (
     _factor,
     _solve_factored,
     _solve_fluxes,
+    copy_matrix,
+    copy_vector,
 )
 from photutils_mgauss.kernels.stamp_draw import (
     contract,
@@ -387,8 +389,8 @@ def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed, rows,
                 return cost, FIT_CONVERGED, n_steps
             continue
         drop = cost - trial_cost
-        shapes[:] = trial
-        fluxes[:] = trial_fluxes
+        copy_matrix(trial, trial.shape[0], trial.shape[1], shapes)
+        copy_vector(trial_fluxes, trial_fluxes.size, fluxes)
         small = small + 1 if drop <= tolerance * cost else 0
         cost = trial_cost
         if small >= 2:

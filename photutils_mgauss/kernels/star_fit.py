@@ -12,7 +12,12 @@ from photutils_mgauss.kernels.descent import (
     remainder,
 )
 from photutils_mgauss.kernels.jit import inner, kernel
-from photutils_mgauss.kernels.linear import _factorize, _solve
+from photutils_mgauss.kernels.linear import (
+    _factorize,
+    _solve,
+    copy_matrix,
+    copy_vector,
+)
 from photutils_mgauss.kernels.tile import LANES, fill_derivatives
 
 # Fits of stars: flux, x and y of each, by Levenberg-Marquardt.
@@ -349,12 +354,13 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
         gain = ((best - chi2[0]) / expected if expected > 1e-9 * best
                 else POOR_GAIN)
         fall = best - chi2[0]
-        parameters[:size] = trial[:size]
+        copy_vector(trial, size, parameters)
         best = chi2[1]
-        for source, target in ((new[0], old[0]), (new[1], old[1])):
-            target[:n] = source[:n]
-        old[2][:size, :size] = new[2][:size, :size]
-        old[3][:size] = new[3][:size]
+        area = new[0].shape[1]
+        copy_matrix(new[0], n, area, old[0])
+        copy_matrix(new[1], n, area, old[1])
+        copy_matrix(new[2], size, size, old[2])
+        copy_vector(new[3], size, old[3])
         if remainder(length, last) < STEP_TOLERANCE:
             return CONVERGED, iteration + 2
         last = length
@@ -449,8 +455,23 @@ def _load_group(image, error, mask, stars, fixed, parameters, limits, data,
 @inner
 def _scatter(sums, n_pixels, n_free):
     """Return the variance of residuals, NaN without degrees of freedom."""
-    return sums[:, 2].sum() / (n_pixels - n_free) if (
-        n_pixels > n_free) else np.nan
+    if n_pixels <= n_free:
+        return np.nan
+    total = 0.0
+    for s in range(sums.shape[0]):
+        total += sums[s, 2]
+    return total / (n_pixels - n_free)
+
+
+@inner
+def _largest(starts, boxes):
+    """Return the most stars of a group and the most pixels of a box."""
+    most, area = 1, 1
+    for g in range(starts.size - 1):
+        most = max(most, starts[g + 1] - starts[g])
+    for s in range(boxes.shape[0]):
+        area = max(area, boxes[s, 2] * boxes[s, 3])
+    return most, area
 
 
 @kernel
@@ -468,8 +489,10 @@ def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
     (n, 3, 3), sums (n, 3) as of _measure_fit, outcome (n, 2) with the number
     of evaluations.
     """
-    most = np.max(np.diff(starts)) if starts.size > 1 else 1
-    area = np.max(boxes[:, 2] * boxes[:, 3]) if boxes.size else 1
+    most, area = _largest(starts, boxes)
+    n_free = 0
+    for c in range(fixed.size):
+        n_free += not fixed[c]
     size = 3 * most + 1
     data, variance = np.empty((most, area)), np.empty((most, area))
     old = (np.zeros((most, area)), np.empty((most, area)),
@@ -503,12 +526,12 @@ def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
                      old[0], old[1], n, sums[stars])
         factor = 1.0
         if error.size == 0 and gain == 0:
-            factor = _scatter(sums[stars], n_pixels,
-                              n * np.sum(~fixed) + fit_sky)
-        covariances[stars] *= factor
+            factor = _scatter(sums[stars], n_pixels, n * n_free + fit_sky)
         for s in range(n):
             for b in range(3):
                 fitted[starts[g] + s, b] = parameters[3 * s + b]
+                for c in range(3):
+                    covariances[starts[g] + s, b, c] *= factor
         if fit_sky:
             fitted_sky[stars, 0] = parameters[3 * n]
             fitted_sky[stars, 1] = sqrt(factor * sky_variance)
@@ -533,7 +556,7 @@ def star_equations(image, error, mask, boxes, parameters, psf, chi2, n_pixels,
     parameters (n, 3) are flux, x and y. Stars without pixels contribute
     nothing; n_pixels (n,) is -1 where an error is not positive and finite.
     """
-    area = max(1, np.max(boxes[:, 2] * boxes[:, 3]))
+    _, area = _largest(np.empty(0, np.int64), boxes)
     data, variance = np.empty((1, area)), np.empty((1, area))
     new = (np.zeros((1, area)), np.empty((1, area)), np.empty((3, 3)),
            np.empty(3))
