@@ -92,7 +92,7 @@ def pixel_error(light, *, sky=0, read_noise=0, gain=1, exposure_time=None):
         Negative light counts as none. The error of a masked pixel is NaN, a
         unit comes back: see :ref:`pixels`.
     sky, read_noise, gain, exposure_time : optional
-        As for `background_error`; ``sky`` may be an image.
+        As for ``background_error``; ``sky`` may be an image.
 
     Returns
     -------
@@ -190,7 +190,7 @@ def cramer_rao(psf, flux, sky=0, *, x=0, y=0, read_noise=0, gain=1,
     x, y : (n,) array_like, optional
         The positions [pix].
     read_noise, gain, exposure_time : float, optional
-        As for `background_error`.
+        As for ``background_error``.
     fit_shape : int or (ny, nx) tuple of int, optional
         The pixels used of each star.
     free_sky : bool, optional

@@ -167,7 +167,7 @@ n_components=1)>
 
     @property
     def grid(self):
-        """The mixtures at the nodes as arrays, see `PSFModel`."""
+        """The mixtures at the nodes as arrays, see ``PSFModel``."""
         return self._grid
 
     @property

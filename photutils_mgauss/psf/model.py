@@ -148,7 +148,7 @@ class MultiGaussianPSFModel(PSFModel):
 
     @property
     def grid(self):
-        """The mixture as a grid of one node, see `PSFModel`."""
+        """The mixture as a grid of one node, see ``PSFModel``."""
         return Grid.of_mixture(self.mixture)
 
     def free_shape(self):

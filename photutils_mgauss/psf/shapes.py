@@ -195,11 +195,10 @@ def adaptive_moments(image, *, oversampling=1, origin=None, error=None,
 
     Parameters
     ----------
-    image : (ny, nx) or (n, ny, nx) array_like or NDData, GaussianMixture, or \
-            sequence
-        One image or a stack; one mixture or several, which may differ in
-        their number of Gaussians. The own mask of an image counts, its unit
-        comes back: see :ref:`pixels`.
+    image : array_like or NDData, GaussianMixture, or sequence
+        One image (ny, nx) or a stack (n, ny, nx); one mixture or several,
+        which may differ in their number of Gaussians. The own mask of an
+        image counts, its unit comes back: see :ref:`pixels`.
     oversampling : int or (y, x) tuple of int, optional
         Image pixels per native pixel.
     origin : (x, y) array_like, optional
