@@ -12,7 +12,7 @@ from photutils_mgauss.kernels.grid import blend_weights
 from photutils_mgauss.kernels.jit import inner, kernel, loop
 
 # The PSF of a star and its derivatives by position are summed in a tile, one
-# flat array: for each pixel column _LANES values of the PSF, as many of its
+# flat array: for each pixel column LANES values of the PSF, as many of its
 # derivative by x_0, and as many by y_0. Neighbouring rows are neighbours in
 # memory and fixed offsets lie between the parts, so that the compiler works on
 # several rows at once; their number is a constant, for a remainder of a few
@@ -45,7 +45,7 @@ def strides(nodes, out):
 @loop
 def _walk_starts(a, dx, dy, p, s, q, stride, by_x, by_y, height, walk):
     """
-    Put what a walk along the columns starts from into walk (4, _LANES) flat.
+    Put what a walk along the columns starts from into walk (4, LANES) flat.
 
     For each row the Gaussian in the first column, its quotient with the next
     one, and the factors of the Gaussian in its derivative by x and, short of
@@ -147,7 +147,7 @@ def clear(values, n):
 
 @inner
 def _fill_tile(x_0, y_0, row, column, height, width, psf, tiling):
-    """Put the PSF and its derivatives in up to _LANES rows into the tile."""
+    """Put the PSF and its derivatives in up to LANES rows into the tile."""
     nodes, strides, _, _, integrated = psf
     walk, tile, index, weights = tiling
     clear(walk, walk.size)
