@@ -361,7 +361,7 @@ def _extend(x, scale, y):
         x[i] = y[i] + scale * x[i]
 
 
-@inner
+@inner(allocates=True)
 def _inverses(matrix):
     """Return the inverse of each star's own matrix, 0 where singular."""
     inverse = np.empty(matrix.shape)
@@ -370,7 +370,7 @@ def _inverses(matrix):
     return inverse
 
 
-@kernel
+@kernel(allocates=True)
 def solve_joint(stars, pairs, mesh, tolerance, max_steps, step, mesh_step):
     """
     Solve the joint normal equations by preconditioned conjugate gradients.
@@ -459,7 +459,7 @@ def _scale_matrix(a, size, scale):
             a[r, r] = 1.0
 
 
-@kernel
+@kernel(allocates=True)
 def joint_covariances(stars, pairs, partner, covariance, correlation):
     """
     Put the covariance of each star, neighbours free, into covariance.

@@ -261,7 +261,7 @@ def _score_pixel(x, y, count, fit, template, weight, least, scratch):
     return g / sqrt(info + sums[2]), g / info
 
 
-@kernel
+@kernel(allocates=True)
 def score_beside(fit, templates, planes, limits, significance, flux):
     r"""
     Ask how significant a further star would be on pixels close to stars.

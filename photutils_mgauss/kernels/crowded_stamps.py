@@ -49,7 +49,7 @@ class Stamps(NamedTuple):
     derivatives: np.ndarray
 
 
-@kernel
+@kernel(allocates=True)
 def star_stamps(chosen, sources, stamps, gaussians):
     """Fill the stamps of the chosen stars."""
     x, y, _ = sources
@@ -161,7 +161,7 @@ def _add_stamp(left, bottom, w, flux, profile, image):
             image[bottom + j, k] += flux * profile[first + k]
 
 
-@kernel
+@kernel(allocates=True)
 def add_stars(chosen, sign, sources, stamps, wing, gaussians, faintest,
               image):
     """

@@ -154,7 +154,7 @@ def _shift_sources(sources, n_sources, sky, fit_sky, step):
     return sky
 
 
-@kernel
+@kernel(allocates=True)
 def field_normal(stamps, weights, corners, basis, rows, jacobians, sources,
                  anchors, hold, n_sources, sky, fit_sky, used, n_steps,
                  normal, total, gradient, chi2):
@@ -204,7 +204,7 @@ def field_normal(stamps, weights, corners, basis, rows, jacobians, sources,
             _spread(normal, own, size, basis[star], spread, total, gradient)
 
 
-@inner
+@inner(allocates=True)
 def _condense(normal, own, size, jacobian, out):
     """Put J^T A J and J^T b into out (P, P + 1), upper triangle."""
     n, p = jacobian.shape

@@ -64,7 +64,7 @@ def blend_weights(x_0, y_0, x_grid, y_grid, index, weights):
         weights[2, corner] = wx * (sy if top else -sy)
 
 
-@kernel
+@kernel(allocates=True)
 def evaluate_grid(x, y, flux, x_0, y_0, nodes, x_grid, y_grid, integrated,
                   out):
     """
@@ -92,7 +92,7 @@ def evaluate_grid(x, y, flux, x_0, y_0, nodes, x_grid, y_grid, integrated,
         out[i] *= flux[i if flux.size > 1 else 0]
 
 
-@kernel
+@kernel(allocates=True)
 def differentiate_grid(x, y, x_0, y_0, nodes, x_grid, y_grid, integrated,
                        out):
     """
@@ -125,7 +125,7 @@ def _add_stamp(rows, x_0, y_0, flux, integrated, px, py, out):
                        out.reshape(px.size))
 
 
-@inner
+@inner(allocates=True)
 def _pixel_positions(ny, nx):
     px = np.empty(ny * nx)
     py = np.empty(ny * nx)
@@ -135,7 +135,7 @@ def _pixel_positions(ny, nx):
     return px, py
 
 
-@kernel
+@kernel(allocates=True)
 def render_grid(x, y, flux, left, bottom, nodes, x_grid, y_grid, integrated,
                 out):
     """
@@ -160,7 +160,7 @@ def render_grid(x, y, flux, left, bottom, nodes, x_grid, y_grid, integrated,
 # second moments of their sum. sums is (M, K, 6) and holds of each Gaussian
 # the integrals of 1, x, y, x^2, xy, y^2, which blend linearly.
 
-@inner
+@inner(allocates=True)
 def match_rows(x_0, y_0, sums, x_grid, y_grid, rows, slopes):
     """
     Put the K blended Gaussians at (x_0, y_0) into rows (K, 6).
@@ -218,7 +218,7 @@ def _central(sums):
             sums[5] / f - my * my)
 
 
-@kernel
+@kernel(allocates=True)
 def evaluate_matched(x, y, flux, x_0, y_0, sums, x_grid, y_grid, integrated,
                      out):
     """Put the PSF of matched Gaussians into out; as `evaluate_grid`."""
@@ -236,7 +236,7 @@ def evaluate_matched(x, y, flux, x_0, y_0, sums, x_grid, y_grid, integrated,
         out[i] *= flux[i if flux.size > 1 else 0]
 
 
-@kernel
+@kernel(allocates=True)
 def differentiate_matched(x, y, x_0, y_0, sums, x_grid, y_grid, integrated,
                           out):
     """Put value and derivatives into out (3, n); as `differentiate_grid`."""
@@ -263,7 +263,7 @@ def differentiate_matched(x, y, x_0, y_0, sums, x_grid, y_grid, integrated,
             out[2, i] -= a * gy
 
 
-@kernel
+@kernel(allocates=True)
 def render_matched(x, y, flux, left, bottom, sums, x_grid, y_grid,
                    integrated, out):
     """Add stars of matched Gaussians to stamps; as `render_grid`."""

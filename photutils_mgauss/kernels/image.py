@@ -179,7 +179,7 @@ def add_star(rows, flux, cx, cy, integrated, faintest, scratch, out):
             add_sampled(peak, cx + mx, cy + my, p, s, q, reach, out)
 
 
-@kernel
+@kernel(allocates=True)
 def render_image(x, y, flux, nodes, x_grid, y_grid, integrated, faintest,
                  left, bottom, out):
     """
@@ -200,7 +200,7 @@ def render_image(x, y, flux, nodes, x_grid, y_grid, integrated, faintest,
                      scratch, out)
 
 
-@kernel
+@kernel(allocates=True)
 def render_matched_image(x, y, flux, sums, x_grid, y_grid, integrated,
                          faintest, left, bottom, out):
     """Add stars as `render_image` does, with matched Gaussians blended."""
@@ -213,7 +213,7 @@ def render_matched_image(x, y, flux, sums, x_grid, y_grid, integrated,
                  faintest, scratch, out)
 
 
-@kernel
+@kernel(allocates=True)
 def bleed(columns, full_well):
     """
     Spread the charge above the full well along each column (n, ny), in place.
@@ -277,7 +277,7 @@ def _add_epsf(image, share, x, y, reach, oversampling, wx, wy, out):
             out[j, i] += share * total
 
 
-@kernel
+@kernel(allocates=True)
 def render_epsfs(x, y, flux, reach, images, x_grid, y_grid, oversampling,
                  left, bottom, out):
     """

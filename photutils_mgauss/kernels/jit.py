@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import warnings
-from functools import cache
+from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
 
@@ -38,19 +38,26 @@ _UNREADABLE = (OSError, EOFError, ValueError, TypeError, AttributeError,
 KERNELS = {}
 
 
-def kernel(function):
+# A function that makes no arrays needs no counts of who holds them. Without
+# them it is compiled in two thirds of the time; numba refuses what needs them.
+
+def kernel(function=None, *, allocates=False):
     """Compile a function that Python calls, when it is first called."""
-    dispatcher = njit(**_OPTIONS)(function)
+    if function is None:
+        return partial(kernel, allocates=allocates)
+    dispatcher = njit(**_OPTIONS, _nrt=allocates)(function)
     if dispatcher is not function:  # it is where numba is switched off
         dispatcher._cache = _keep(function)
         KERNELS[function.__name__] = dispatcher
     return dispatcher
 
 
-def inner(function):
+def inner(function=None, *, allocates=False, pipeline=None):
     """Compile a function into the kernels that call it."""
-    return njit(**_OPTIONS, no_cpython_wrapper=True,
-                pipeline_class=_InnerCompiler)(function)
+    if function is None:
+        return partial(inner, allocates=allocates, pipeline=pipeline)
+    return njit(**_OPTIONS, _nrt=allocates, no_cpython_wrapper=True,
+                pipeline_class=pipeline or _InnerCompiler)(function)
 
 
 def loop(function):
@@ -60,8 +67,7 @@ def loop(function):
     For the innermost loops: within the code of a large kernel the compiler no
     longer sees that it can work on several pixels at once.
     """
-    return njit(**_OPTIONS, no_cpython_wrapper=True,
-                pipeline_class=_LoopCompiler)(function)
+    return inner(function, pipeline=_LoopCompiler)
 
 
 def folder():

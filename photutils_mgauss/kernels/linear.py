@@ -43,7 +43,7 @@ def _solve_factored(factor, n, x):
         x[i] /= factor[i, i]
 
 
-@inner
+@inner(allocates=True)
 def _solve_subset(gram, rhs, active, x, work):
     """Solve gram x = rhs over the active unknowns; the others are zero."""
     n = rhs.size

@@ -140,7 +140,7 @@ def _ending(change):
     return MOMENTS_CONVERGED
 
 
-@kernel
+@kernel(allocates=True)
 def adapt_to_images(images, used, states, tolerance, max_steps, largest,
                     sums, status):
     """

@@ -56,7 +56,7 @@ def _hinge(excess, slopes, stiffness, matrix, gradient):
     return stiffness * excess * excess
 
 
-@kernel
+@kernel(allocates=True)
 def penalty(shape, limits, matrix, gradient):
     """
     Return the price of a Gaussian outside its limits.
@@ -162,7 +162,7 @@ def _dot(a, b, lane):
     return lane.sum()
 
 
-@inner
+@inner(allocates=True)
 def _add_rows_to_fluxes(rows, stamp, images, lane, gram, rhs):
     """Add rows (m, ny, nx) over the residual to the equations of fluxes."""
     seen = np.empty(images.shape[0])
@@ -176,7 +176,7 @@ def _add_rows_to_fluxes(rows, stamp, images, lane, gram, rhs):
                 gram[k, other] += seen[k] * seen[other]
 
 
-@inner
+@inner(allocates=True)
 def _add_rows(rows, centre, residual, images, fluxes, polynomials, columns,
               matrix, gradient):
     """Add rows (m, ny, nx) over the residual to the normal equations."""

@@ -474,7 +474,7 @@ def _largest(starts, boxes):
     return most, area
 
 
-@kernel
+@kernel(allocates=True)
 def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
               fixed, fit_sky, gain, psf, max_iterations, fitted, fitted_sky,
               covariances, sums, outcome):
@@ -539,7 +539,7 @@ def fit_stars(image, error, mask, starts, boxes, initial, sky, lower, upper,
         outcome[stars, 1] = evaluations
 
 
-@kernel
+@kernel(allocates=True)
 def star_derivatives(x_0, y_0, box, psf, out):
     """Put the unit-flux PSF in a box, d/dx_0 and d/dy_0 into out (3, n)."""
     tiling = (np.empty(4 * LANES), np.empty(3 * LANES * box[3]),
@@ -547,7 +547,7 @@ def star_derivatives(x_0, y_0, box, psf, out):
     fill_derivatives(x_0, y_0, box, psf, tiling, out)
 
 
-@kernel
+@kernel(allocates=True)
 def star_equations(image, error, mask, boxes, parameters, psf, chi2, n_pixels,
                    matrices, gradients):
     """
