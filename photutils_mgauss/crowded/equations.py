@@ -49,11 +49,12 @@ class Equations:
         """Return the Gauss-Newton steps of the stars (n, 3) and the level."""
         stars = self.stars._replace(
             matrix=self.stars.matrix * (1 + damping * np.eye(3)))
-        step = np.zeros(self.stars.gradient.shape)
-        level_step = np.zeros(self.mesh.gradient.shape)
-        kernels.solve_joint(stars, self.neighbours.pairs, self.mesh,
-                            _TOLERANCE, _CG_STEPS, step, level_step)
-        return step, level_step
+        n = len(stars.matrix)
+        step = np.zeros(3 * n + self.mesh.gradient.size)
+        kernels.solve_joint(
+            stars, self.neighbours.pairs, self.mesh, _TOLERANCE, _CG_STEPS,
+            np.empty((n, 3, 3)), np.empty((4, step.size)), step)
+        return step[:3 * n].reshape(n, 3), step[3 * n:]
 
     def covariances(self):
         """Return covariances with neighbours free, and correlations."""

@@ -2,6 +2,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from photutils_mgauss import kernels
 
@@ -130,20 +131,17 @@ class Neighbours:
     @classmethod
     def of(cls, x, y):
         """List the pairs of stars that are solved for together."""
-        cells = _cells(x, y)
-        count = np.empty(x.size, np.int64)
-        kernels.count_near(x, y, _PAIR_DISTANCE, cells, count)
+        owner, neighbour, gap = _close_pairs(x, y)
+        count = np.bincount(owner, minlength=x.size)
         indptr = np.concatenate([[0], np.cumsum(count)])
-        neighbour, twin = np.empty((2, indptr[-1]), np.int64)
-        gap = np.empty(indptr[-1])
-        kernels.list_near(x, y, _PAIR_DISTANCE, cells,
-                          kernels.Pairs(indptr, neighbour, twin), gap)
+        # Ordered by neighbour, then owner, the pairs are their twins.
+        twin = np.empty(owner.size, np.int64)
+        twin[np.lexsort([neighbour, owner])] = np.lexsort([owner, neighbour])
         has = count > 0
         nearest, distance = np.full(x.size, -1), np.full(x.size, np.inf)
         nearest[has] = neighbour[indptr[:-1][has]]
         distance[has] = gap[indptr[:-1][has]]
-        return cls(indptr, neighbour, twin,
-                   np.repeat(np.arange(x.size), count), nearest, distance)
+        return cls(indptr, neighbour, twin, owner, nearest, distance)
 
     @property
     def pairs(self):
@@ -151,14 +149,17 @@ class Neighbours:
         return kernels.Pairs(self.indptr, self.neighbour, self.twin)
 
 
-def _cells(x, y):
-    """Sort points into cells as wide as pairs reach."""
-    row, column = (
-        (np.floor((v - v.min()) / _PAIR_DISTANCE).astype(int) + 1
-         if v.size else np.empty(0, int)) for v in (y, x))
-    columns = column.max(initial=0) + 2
-    cell = row * columns + column
-    count = np.bincount(cell, minlength=(row.max(initial=0) + 2) * columns)
-    return kernels.Cells(cell, int(columns),
-                         np.concatenate([[0], np.cumsum(count)]),
-                         np.argsort(cell, kind='stable'))
+def _close_pairs(x, y):
+    """
+    Return pairs of points within reach of each other, and their distances.
+
+    Each pair both ways round, ordered by its first point, nearest first.
+    """
+    if x.size < 2:
+        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+    pairs = cKDTree(np.column_stack([x, y])).query_pairs(
+        _PAIR_DISTANCE, output_type='ndarray')
+    owner, neighbour = np.concatenate([pairs, pairs[:, ::-1]]).T
+    gap = np.hypot(x[owner] - x[neighbour], y[owner] - y[neighbour])
+    order = np.lexsort([neighbour, gap, owner])
+    return owner[order], neighbour[order], gap[order]

@@ -12,19 +12,18 @@ from functools import partial
 
 import numpy as np
 
-from photutils_mgauss import kernels
 from photutils_mgauss.fitting.search import (
+    Equations,
     Stamp,
     StampProblem,
-    Workspace,
     covariance_of,
-    draw_model,
     mixture_of,
     narrow_first,
     refine_astrometry,
     run,
     search,
     stamp_shapes,
+    workspace,
 )
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.image import check_errors, read_stack, with_unit
@@ -358,7 +357,7 @@ def _as_starts(start, n, problem):
 
 def _fit_stack(problem, images, weights, starts):
     shape = images.shape[1:]
-    spaces = [Workspace(k, shape) for k in range(problem.n_components + 1)]
+    spaces = [workspace(k, shape) for k in range(problem.n_components + 1)]
     return [_fit_image(problem, spaces, *item)
             for item in zip(images, weights, starts, strict=True)]
 
@@ -377,8 +376,9 @@ def _fit_image(problem, spaces, image, weight, start):
         solution = refine_astrometry(stamp, problem, spaces, solution)
     if not solution.has_flux:
         return _failure(FitStatus.EMPTY, image)
-    return _report(problem, stamp, image, narrow_first(solution),
-                   spaces[problem.n_components])
+    solution = narrow_first(solution)
+    return _report(problem, stamp, image, solution,
+                   Equations.at(solution, stamp, problem, spaces))
 
 
 def _failure(status, image):
@@ -445,12 +445,12 @@ def _inside(problem, pixels, peak):
 
 # From the solution to the result.
 
-def _report(problem, stamp, image, solution, space):
+def _report(problem, stamp, image, solution, equations):
     """Return the MixtureFit of a solution, narrow Gaussians first."""
     area = np.prod(problem.pitch)
     total = stamp.tie[0] if problem.tied else solution.fluxes.sum()
     mixture = mixture_of(solution, problem, stamp.centre)
-    model = draw_model(solution, mixture.weights, stamp, space)
+    model = np.tensordot(mixture.weights, equations.images, 1)
     model = model[:, :image.shape[1]]
     residual = image - stamp.scale * total * model
     weight = stamp.weight[:, :image.shape[1]]
@@ -458,24 +458,22 @@ def _report(problem, stamp, image, solution, space):
     n = np.count_nonzero(used)
     weight = weight[used] * stamp.weight_unit
     chi2 = float((weight * residual[used] ** 2).sum())
-    covariance = covariance_of(problem, stamp, solution, space)
+    covariance = covariance_of(problem, stamp, solution, equations)
     if not problem.has_error:
         covariance *= chi2 / max(n - problem.n_parameters, 1)
-    status = _judge(solution, stamp)
+    status = _judge(solution, equations.price)
     return MixtureFit(
         mixture, status, status.sentence, float(stamp.scale * total / area),
         chi2, _bic(chi2, n, problem), float(model[used].sum()), residual,
         covariance, used)
 
 
-def _judge(solution, stamp):
+def _judge(solution, price):
     """Return the status of a solution."""
     if (solution.fluxes == 0).any():
         return FitStatus.VANISHED
     if solution.stopped:
         return FitStatus.STOPPED
-    price = sum(kernels.penalty(shape, stamp.limits, np.empty((5, 5)),
-                                np.empty(5)) for shape in solution.shapes)
     return FitStatus.AT_LIMIT if price > 0 else FitStatus.CONVERGED
 
 

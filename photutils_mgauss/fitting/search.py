@@ -74,30 +74,10 @@ class StampProblem(NamedTuple):
         return self.n_components * per_gaussian - self.tied
 
 
-class Workspace:
-    """
-    The memory in which kernels fit K Gaussians to stamps of one shape.
-
-    Parameters
-    ----------
-    n_components : int
-        The number K of Gaussians.
-    shape : (ny, nx) tuple of int
-        The shape of the stamps.
-    """
-
-    def __init__(self, n_components, shape):
-        k, n = n_components, 6 * n_components
-        shape = shape[0], _wide(shape[1])
-        self.scratch = (
-            np.empty((k, *shape)), np.empty(shape), np.empty(shape),
-            np.empty((k, k)), np.empty(k), np.empty((k, k + 1)),
-            np.empty(k, bool), np.empty((5, shape[1])), np.empty((k, 6, 6)),
-            np.empty(6), np.empty((5, 5)), np.empty((6, 6)),
-            np.empty((6, 6)))
-        self.matrices = np.empty((n, n)), np.empty((n, n))
-        self.vectors = (np.empty(n), np.empty(n), np.empty((k, 5)),
-                        np.empty(k))
+def workspace(n_components, shape):
+    """Return the memory in which kernels fit K Gaussians to stamps."""
+    return kernels.StampScratch.empty(n_components,
+                                      (shape[0], _wide(shape[1])))
 
 
 class Stamp(NamedTuple):
@@ -137,6 +117,12 @@ class Stamp(NamedTuple):
         pixels = _widened(pixels)
         return cls(pixels, _widened(weight / weight_unit), centre, peak, tie,
                    np.empty((0, *pixels.shape)), limits, scale, weight_unit)
+
+    def target(self, problem):
+        """Return the stamp as the kernels take it."""
+        return kernels.StampTarget(
+            self.pixels, self.weight, self.centre, self.tie, problem.signed,
+            self.rows, problem.fixed, self.limits)
 
 
 def _wide(nx):
@@ -197,12 +183,9 @@ def _run_all(stamp, problem, spaces, starts, max_steps):
     """Return what it makes of each of several starts (n, K, 5)."""
     n, k = starts.shape[:2]
     trials = Trials(starts.copy(), np.empty((n, k)), np.empty(n), np.empty(n))
-    space = spaces[k]
     kernels.fit_starts(
-        stamp.pixels, stamp.weight, stamp.centre, trials.shapes,
-        trials.fluxes, stamp.tie, problem.signed, stamp.rows, problem.fixed,
-        stamp.limits, _TOLERANCE, max_steps, space.scratch, space.matrices,
-        space.vectors, trials.costs, trials.statuses)
+        stamp.target(problem), trials.shapes, trials.fluxes, _TOLERANCE,
+        max_steps, spaces[k], trials.costs, trials.statuses)
     order = np.argsort(trials.costs, kind='stable')
     return Trials(*(each[order] for each in trials))
 
@@ -376,33 +359,36 @@ def mixture_of(solution, problem, centre):
                                         -t / norm)
 
 
-def draw_model(solution, weights, stamp, space):
-    """Return the mixture of unit flux on the stamp's pixels."""
-    images, lanes = space.scratch[0], space.scratch[7]
-    kernels.draw_unit(solution.shapes, *stamp.centre, lanes[:4], images)
-    return np.tensordot(weights, images, 1)
+class Equations(NamedTuple):
+    """What kernels know of a solution, the sums for astrometry left out."""
+
+    images: np.ndarray
+    matrix: np.ndarray
+    fluxes: np.ndarray
+    price: float
+
+    @classmethod
+    def at(cls, solution, stamp, problem, spaces):
+        """Form the normal equations at a solution."""
+        stamp = stamp._replace(rows=stamp.rows[:0])
+        fluxes = run(stamp, problem, spaces, solution.shapes, 0).fluxes
+        space = spaces[len(fluxes)]
+        return cls(space.images, space.matrix, fluxes, space.price[0])
 
 
-def covariance_of(problem, stamp, solution, space):
+def covariance_of(problem, stamp, solution, equations):
     """
     Return the covariance (6K, 6K) of the parameters users see.
 
     It is the inverse of the normal matrix, for the Gaussians that have flux
     and the parameters that are free.
     """
-    n = problem.n_components
-    matrix, gradient = np.empty((6 * n, 6 * n)), np.empty(6 * n)
-    kernels.project(stamp.pixels, stamp.weight, stamp.centre,
-                    solution.shapes, stamp.tie, problem.signed,
-                    stamp.rows[:0], solution.fluxes.copy(), space.scratch)
-    kernels.normal_equations(
-        stamp.weight, stamp.centre, solution.shapes, solution.fluxes,
-        stamp.tie, stamp.rows[:0], space.scratch, matrix, gradient)
-    kernels.add_penalties(solution.shapes, stamp.limits, matrix, gradient)
+    n, fluxes = problem.n_components, equations.fluxes
+    matrix = equations.matrix
     # From fluxes first to Gaussian by Gaussian.
     place = np.column_stack([np.arange(n),
                              np.arange(n, 6 * n).reshape(n, 5)]).ravel()
-    free = np.repeat(solution.fluxes != 0, 6)
+    free = np.repeat(fluxes != 0, 6)
     if problem.fixed:
         free &= np.tile([True, False, False, True, True, True], n)
     chosen = np.ix_(place[free], place[free])
@@ -412,7 +398,7 @@ def covariance_of(problem, stamp, solution, space):
     slopes = slopes @ (directions[:, seen] / np.sqrt(powers[seen]))
     covariance = slopes @ slopes.T
     covariance /= stamp.weight_unit * stamp.scale**2
-    unknown = np.repeat(solution.fluxes == 0, 6)
+    unknown = np.repeat(fluxes == 0, 6)
     covariance[unknown] = covariance[:, unknown] = np.nan
     return covariance
 

@@ -6,9 +6,10 @@ import numpy as np
 
 from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import (
-    _cholesky,
-    _factor_inverse_columns,
-    _invert_3x3,
+    cholesky,
+    copy_vector,
+    invert_3x3,
+    solve_factored,
 )
 
 # Star i lies on a stamp (`crowded_stamps`); its parameters are ordered flux,
@@ -16,20 +17,6 @@ from photutils_mgauss.kernels.linear import (
 
 # The covariance of a star is that with so many stars free, itself included.
 _MOST_FREE = 13
-
-
-class Cells(NamedTuple):
-    """
-    Points sorted into square cells, in rows of so many columns.
-
-    Nothing is in the outermost cells; cell (n,) is where each point is, order
-    lists the points of cell c from start[c] to start[c + 1].
-    """
-
-    cell: np.ndarray
-    columns: int
-    start: np.ndarray
-    order: np.ndarray
 
 
 class Pairs(NamedTuple):
@@ -98,63 +85,6 @@ def mesh_sums(weight, residual, background, rows, columns, n_columns, clip,
             if w * r * r <= clip * clip:
                 out[node, 1] += w
                 out[node, 2] += w * (r + background[j, i])
-
-
-@inner
-def _next_row(i, row, cells):
-    """Return where the points around i begin and end, in a row of cells."""
-    middle = cells.cell[i] + row * cells.columns
-    return cells.start[middle - 1], cells.start[middle + 2]
-
-
-@kernel
-def count_near(x, y, reach, cells, count):
-    """
-    Put the number of other points within reach of each into count (n,).
-
-    Cells are as wide as reach.
-    """
-    for i in range(x.size):
-        count[i] = 0
-        for row in range(-1, 2):
-            first, last = _next_row(i, row, cells)
-            for at in range(first, last):
-                j = cells.order[at]
-                if j != i and sqrt((x[j] - x[i])**2
-                                   + (y[j] - y[i])**2) <= reach:
-                    count[i] += 1
-
-
-@kernel
-def list_near(x, y, reach, cells, pairs, distance):
-    """
-    List the points within reach of each, nearest first.
-
-    Fills neighbour and twin of the pairs, and distance (n_pairs,). Cells are
-    as wide as reach.
-    """
-    indptr, neighbour, twin = pairs
-    for i in range(x.size):
-        end = indptr[i]
-        for row in range(-1, 2):
-            first, last = _next_row(i, row, cells)
-            for at in range(first, last):
-                j = cells.order[at]
-                gap = sqrt((x[j] - x[i])**2 + (y[j] - y[i])**2)
-                if j == i or gap > reach:
-                    continue
-                to = end
-                while to > indptr[i] and (distance[to - 1] > gap or (
-                        distance[to - 1] == gap and neighbour[to - 1] > j)):
-                    neighbour[to] = neighbour[to - 1]
-                    distance[to] = distance[to - 1]
-                    to -= 1
-                neighbour[to] = j
-                distance[to] = gap
-                end += 1
-    for i in range(x.size):
-        for pair in range(indptr[i], indptr[i + 1]):
-            twin[pair] = find_pair(neighbour[pair], i, indptr, neighbour)
 
 
 @inner
@@ -267,138 +197,129 @@ def _pair_block(i, j, stamps, weight, block):
     block[2, 0], block[2, 1], block[2, 2] = b20, b21, b22
 
 
+# The unknowns of the joint equations are one flat vector: three numbers for
+# each star, then the level of each node of the background.
+
 @inner
-def _apply_mesh(v, mesh, out):
-    """Multiply v (m,) by the matrix of a background."""
+def _apply_mesh(v, first, mesh, out):
+    """Multiply v[first:] by the matrix of a background."""
     diagonal, tie, columns = mesh.diagonal, mesh.tie, mesh.columns
-    for m in range(v.size):
+    for m in range(diagonal.size):
+        at = first + m
         column = m % columns
         near = 0.0
         if column > 0:
-            near += v[m - 1]
+            near += v[at - 1]
         if column < columns - 1:
-            near += v[m + 1]
+            near += v[at + 1]
         if m >= columns:
-            near += v[m - columns]
-        if m < v.size - columns:
-            near += v[m + columns]
-        out[m] = diagonal[m] * v[m] - tie * near
+            near += v[at - columns]
+        if m < diagonal.size - columns:
+            near += v[at + columns]
+        out[at] = diagonal[m] * v[at] - tie * near
 
 
 @inner
-def _apply_joint(v, mesh_v, stars, pairs, mesh, out, mesh_out):
+def _apply_joint(v, stars, pairs, mesh, out):
     """
     Multiply by the joint normal matrix of stars and background.
 
     Returns the product of v and the outcome.
     """
-    _apply_mesh(mesh_v, mesh, mesh_out)
     matrix, _, coupling, blocks = stars
     indptr, neighbour, _ = pairs
     node, share = mesh.node, mesh.share
+    first = 3 * matrix.shape[0]
+    _apply_mesh(v, first, mesh, out)
     product = 0.0
-    for i in range(v.shape[0]):
+    for i in range(matrix.shape[0]):
         level = 0.0
         for c in range(4):
-            level += share[i, c] * mesh_v[node[i, c]]
+            level += share[i, c] * v[first + node[i, c]]
         o0 = coupling[i, 0] * level
         o1 = coupling[i, 1] * level
         o2 = coupling[i, 2] * level
         a = matrix[i]
-        v0, v1, v2 = v[i, 0], v[i, 1], v[i, 2]
+        v0, v1, v2 = v[3 * i], v[3 * i + 1], v[3 * i + 2]
         o0 += a[0, 0] * v0 + a[0, 1] * v1 + a[0, 2] * v2
         o1 += a[1, 0] * v0 + a[1, 1] * v1 + a[1, 2] * v2
         o2 += a[2, 0] * v0 + a[2, 1] * v1 + a[2, 2] * v2
         light = (coupling[i, 0] * v0 + coupling[i, 1] * v1
                  + coupling[i, 2] * v2)
         for c in range(4):
-            mesh_out[node[i, c]] += share[i, c] * light
+            out[first + node[i, c]] += share[i, c] * light
         for pair in range(indptr[i], indptr[i + 1]):
             b = blocks[pair]
-            j = neighbour[pair]
-            w0, w1, w2 = v[j, 0], v[j, 1], v[j, 2]
+            j = 3 * neighbour[pair]
+            w0, w1, w2 = v[j], v[j + 1], v[j + 2]
             o0 += b[0, 0] * w0 + b[0, 1] * w1 + b[0, 2] * w2
             o1 += b[1, 0] * w0 + b[1, 1] * w1 + b[1, 2] * w2
             o2 += b[2, 0] * w0 + b[2, 1] * w1 + b[2, 2] * w2
-        out[i, 0] = o0
-        out[i, 1] = o1
-        out[i, 2] = o2
+        out[3 * i], out[3 * i + 1], out[3 * i + 2] = o0, o1, o2
         product += v0 * o0 + v1 * o1 + v2 * o2
-    for m in range(mesh_v.size):
-        product += mesh_v[m] * mesh_out[m]
+    for m in range(first, v.size):
+        product += v[m] * out[m]
     return product
 
 
 @inner
-def _precondition(inverse, mesh, r, mesh_r, z, mesh_z):
+def _precondition(inverse, diagonal, r, z):
     """Put r times the inverse blocks into z; return the product of both."""
     product = 0.0
-    for i in range(r.shape[0]):
+    for i in range(inverse.shape[0]):
         c = inverse[i]
-        r0, r1, r2 = r[i, 0], r[i, 1], r[i, 2]
+        r0, r1, r2 = r[3 * i], r[3 * i + 1], r[3 * i + 2]
         z0 = c[0, 0] * r0 + c[0, 1] * r1 + c[0, 2] * r2
         z1 = c[1, 0] * r0 + c[1, 1] * r1 + c[1, 2] * r2
         z2 = c[2, 0] * r0 + c[2, 1] * r1 + c[2, 2] * r2
-        z[i, 0], z[i, 1], z[i, 2] = z0, z1, z2
+        z[3 * i], z[3 * i + 1], z[3 * i + 2] = z0, z1, z2
         product += r0 * z0 + r1 * z1 + r2 * z2
-    for m in range(mesh_r.size):
-        mesh_z[m] = mesh_r[m] / mesh[m]
-        product += mesh_r[m] * mesh_z[m]
+    first = 3 * inverse.shape[0]
+    for m in range(diagonal.size):
+        z[first + m] = r[first + m] / diagonal[m]
+        product += r[first + m] * z[first + m]
     return product
 
 
 @inner
-def _add_scaled(x, scale, y):
-    """Add scale * y to x, both flat."""
-    for i in range(x.size):
-        x[i] += scale * y[i]
+def _begin(stars, mesh, inverse, r):
+    """Put the right side into r, and the inverse of each star's block."""
+    n = inverse.shape[0]
+    for i in range(n):
+        invert_3x3(stars.matrix[i], inverse[i])
+        for c in range(3):
+            r[3 * i + c] = stars.gradient[i, c]
+    for m in range(mesh.gradient.size):
+        r[3 * n + m] = mesh.gradient[m]
 
 
-@inner
-def _extend(x, scale, y):
-    """Put y + scale * x into x, both flat."""
-    for i in range(x.size):
-        x[i] = y[i] + scale * x[i]
-
-
-@inner(allocates=True)
-def _inverses(matrix):
-    """Return the inverse of each star's own matrix, 0 where singular."""
-    inverse = np.empty(matrix.shape)
-    for i in range(matrix.shape[0]):
-        _invert_3x3(matrix[i], inverse[i])
-    return inverse
-
-
-@kernel(allocates=True)
-def solve_joint(stars, pairs, mesh, tolerance, max_steps, step, mesh_step):
+@kernel
+def solve_joint(stars, pairs, mesh, tolerance, max_steps, inverse, scratch,
+                step):
     """
     Solve the joint normal equations by preconditioned conjugate gradients.
 
     Each star's own block is the preconditioner; stars whose block is singular
-    do not move. step (n, 3) and mesh_step (m,) begin at zero. Returns the
-    number of steps.
+    do not move. step (3 n + m,) begins at zero; inverse (n, 3, 3) and
+    scratch (4, 3 n + m) are scratch. Returns the number of steps.
     """
-    inverse = _inverses(stars.matrix)
-    r, mesh_r = stars.gradient.copy(), mesh.gradient.copy()
-    z, mesh_z = np.empty_like(r), np.empty_like(mesh_r)
+    r, z, v, a = scratch[0], scratch[1], scratch[2], scratch[3]
+    _begin(stars, mesh, inverse, r)
     # A preconditioner of zero keeps singular stars out of z, and so of v.
-    rz = _precondition(inverse, mesh.diagonal, r, mesh_r, z, mesh_z)
-    v, mesh_v = z.copy(), mesh_z.copy()
-    a, mesh_a = np.empty_like(r), np.empty_like(mesh_r)
+    rz = _precondition(inverse, mesh.diagonal, r, z)
+    copy_vector(z, z.size, v)
     goal = tolerance * tolerance * rz
     for count in range(max_steps):
         if not rz > goal:
             return count
-        alpha = rz / _apply_joint(v, mesh_v, stars, pairs, mesh, a, mesh_a)
-        _add_scaled(step.reshape(-1), alpha, v.reshape(-1))
-        _add_scaled(mesh_step, alpha, mesh_v)
-        _add_scaled(r.reshape(-1), -alpha, a.reshape(-1))
-        _add_scaled(mesh_r, -alpha, mesh_a)
+        alpha = rz / _apply_joint(v, stars, pairs, mesh, a)
+        for i in range(step.size):
+            step[i] += alpha * v[i]
+            r[i] -= alpha * a[i]
         before = rz
-        rz = _precondition(inverse, mesh.diagonal, r, mesh_r, z, mesh_z)
-        _extend(v.reshape(-1), rz / before, z.reshape(-1))
-        _extend(mesh_v, rz / before, mesh_z)
+        rz = _precondition(inverse, mesh.diagonal, r, z)
+        for i in range(step.size):
+            v[i] = z[i] + rz / before * v[i]
     return max_steps
 
 
@@ -472,12 +393,11 @@ def joint_covariances(stars, pairs, partner, covariance, correlation):
     matrix, _, _, blocks = stars
     indptr, neighbour, _ = pairs
     n = matrix.shape[0]
-    members = np.empty(_MOST_FREE, np.int64)
-    where = np.full(n, -1, np.int64)
+    members, where = np.empty(_MOST_FREE, np.int64), np.empty(n, np.int64)
+    for i in range(n):
+        where[i] = -1
     a = np.empty((3 * _MOST_FREE, 3 * _MOST_FREE))
-    scale = np.empty(3 * _MOST_FREE)
-    columns = np.empty((3 * _MOST_FREE, 3))
-    alone = np.empty((3 * _MOST_FREE, 1))
+    scale, columns = np.empty(3 * _MOST_FREE), np.empty((4, 3 * _MOST_FREE))
     for i in range(n):
         count = _members(i, indptr, neighbour, members)
         size = 3 * count
@@ -485,10 +405,10 @@ def joint_covariances(stars, pairs, partner, covariance, correlation):
                       a)
         _scale_matrix(a, size, scale)
         correlation[i] = 0.0
-        solved = scale[0] > 0 and _cholesky(a, size)
-        if solved:
-            _factor_inverse_columns(a, size, 0, 3, columns)
+        solved = scale[0] > 0 and cholesky(a, size, 1e-12)
         for r in range(3):
+            if solved:
+                _inverse_column(a, size, r, columns[r])
             for c in range(3):
                 covariance[i, r, c] = (columns[r, c] * scale[r] * scale[c]
                                        if solved else np.nan)
@@ -496,6 +416,14 @@ def joint_covariances(stars, pairs, partner, covariance, correlation):
             continue
         for m in range(1, count):
             if members[m] == partner[i]:
-                _factor_inverse_columns(a, size, 3 * m, 1, alone)
-                correlation[i] = columns[3 * m, 0] / sqrt(
-                    columns[0, 0] * alone[3 * m, 0])
+                _inverse_column(a, size, 3 * m, columns[3])
+                correlation[i] = columns[0, 3 * m] / sqrt(
+                    columns[0, 0] * columns[3, 3 * m])
+
+
+@inner
+def _inverse_column(factor, n, which, out):
+    """Put a column of inverse(factor factor^T) into out[:n]."""
+    for i in range(n):
+        out[i] = 1.0 if i == which else 0.0
+    solve_factored(factor, n, out)

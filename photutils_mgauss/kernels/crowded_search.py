@@ -6,7 +6,7 @@ import numpy as np
 
 from photutils_mgauss.kernels.crowded_fit import find_pair, put_block
 from photutils_mgauss.kernels.jit import inner, kernel
-from photutils_mgauss.kernels.linear import _cholesky
+from photutils_mgauss.kernels.linear import cholesky
 
 # So many stars around a pixel are free to readjust when a further one is
 # looked for there, those within this distance [pix].
@@ -253,7 +253,7 @@ def _score_pixel(x, y, count, fit, template, weight, least, scratch):
     _gather(count, members, fit.equations, fit.pairs.indptr,
             fit.pairs.neighbour, a, right)
     _scale(a, right, 3 * count)
-    if not _cholesky(a, 3 * count):
+    if not cholesky(a, 3 * count, 1e-12):
         return 0.0, 0.0
     info, g = _readjust(3 * count, a, right, sums)
     if info < least * sums[1]:

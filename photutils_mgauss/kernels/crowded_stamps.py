@@ -7,7 +7,8 @@ import numpy as np
 from photutils_mgauss.kernels.gaussian import fast_exp
 from photutils_mgauss.kernels.image import ERRORS, add_sampled, add_star
 from photutils_mgauss.kernels.jit import inner, kernel
-from photutils_mgauss.kernels.tile import LANES, add_gaussian, clear
+from photutils_mgauss.kernels.linear import clear
+from photutils_mgauss.kernels.tile import LANES, add_gaussian
 
 
 class Sources(NamedTuple):
@@ -135,7 +136,7 @@ def _add_lanes(peak, cx, cy, p, s, q, reach, lanes, image):
     _walk_rows(start - 1, low, -1, fall, first, h, d, image)
 
 
-@kernel
+@inner
 def add_wings(rows, flux, cx, cy, integrated, faintest, lanes, scratch,
               image):
     """Add a star, each Gaussian out to where it falls below faintest."""

@@ -5,7 +5,7 @@ import numpy as np
 
 from photutils_mgauss.kernels.gaussian import LOG_NOTHING
 from photutils_mgauss.kernels.jit import inner, kernel
-from photutils_mgauss.kernels.linear import _back_substitute, _eliminate
+from photutils_mgauss.kernels.linear import back_substitute, clear, eliminate
 from photutils_mgauss.kernels.rows import render
 
 # A field of mixtures fitted to the stamps of n stars.
@@ -92,7 +92,8 @@ def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
     if with_shapes:
         size += 6 * rows.shape[0] - 3
         first = own
-    normal[:size, :size] = 0.0
+    for m in range(size):
+        clear(normal[m], size)
     filled = 0
     for j in range(stamp.shape[0]):
         for i in range(stamp.shape[1]):
@@ -100,7 +101,7 @@ def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
             if w <= 0:
                 continue
             row = block[filled]
-            row[:size] = 0.0
+            clear(row, size)
             if fit_sky:
                 row[own - 1] = 1.0
             model = _design(left + i, bottom + j, rows, sources, n_sources,
@@ -113,7 +114,8 @@ def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
             if filled == 4:
                 _add_products(block, size, normal)
                 filled = 0
-    block[filled:, :size] = 0.0
+    for m in range(filled, 4):
+        clear(block[m], size)
     _add_products(block, size, normal)
     return size
 
@@ -189,8 +191,8 @@ def field_normal(stamps, weights, corners, basis, rows, jacobians, sources,
                 block, normal)
             _hold_neighbours(sources[star], anchors[star], n_sources[star],
                              hold[star], size, normal)
-            _eliminate(normal, own, size)
-            _back_substitute(normal, own, size, step)
+            eliminate(normal, own, size)
+            back_substitute(normal, own, size, step)
             sky[star] = _shift_sources(sources[star], n_sources[star],
                                        sky[star], fit_sky, step)
         chi2[star] = normal[size - 1, size - 1]
@@ -208,10 +210,11 @@ def field_normal(stamps, weights, corners, basis, rows, jacobians, sources,
 def _condense(normal, own, size, jacobian, out):
     """Put J^T A J and J^T b into out (P, P + 1), upper triangle."""
     n, p = jacobian.shape
-    out[:] = 0.0
+    for i in range(p):
+        clear(out[i], p + 1)
     line = np.empty(p + 1)
     for i in range(n):
-        line[:] = 0.0
+        clear(line, p + 1)
         for j in range(n):
             a = normal[own + min(i, j), own + max(i, j)]
             for m in range(p):

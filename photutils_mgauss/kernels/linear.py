@@ -1,37 +1,39 @@
 """Small systems of linear equations."""
 from math import sqrt
 
-import numpy as np
-
 from photutils_mgauss.kernels.jit import inner, kernel
 
 
 @inner
-def _factor(matrix, n):
+def cholesky(a, n, least):
     """
-    Overwrite the lower triangle of matrix (n, n) by its Cholesky factor.
+    Overwrite the lower triangle of a (n, n) by its Cholesky factor.
 
-    A pivot lost to rounding is replaced by a huge one, which sets the unknown
-    to zero instead of ending the fit.
+    A pivot below the fraction least of its diagonal is lost to rounding. It
+    is replaced by a huge one, which makes the unknown zero instead of ending
+    a fit. Returns whether no pivot was lost.
     """
+    whole = True
     for j in range(n):
-        diagonal = matrix[j, j]
+        diagonal = a[j, j]
         pivot = diagonal
         for k in range(j):
-            pivot -= matrix[j, k] * matrix[j, k]
-        if not pivot > 1e-14 * diagonal:
+            pivot -= a[j, k] * a[j, k]
+        if not pivot > least * diagonal:
             pivot = 1e30 * max(diagonal, 1e-30)
+            whole = False
         root = sqrt(pivot)
-        matrix[j, j] = root
+        a[j, j] = root
         for i in range(j + 1, n):
-            total = matrix[i, j]
+            value = a[i, j]
             for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] = total / root
+                value -= a[i, k] * a[j, k]
+            a[i, j] = value / root
+    return whole
 
 
 @inner
-def _solve_factored(factor, n, x):
+def solve_factored(factor, n, x):
     """Overwrite x (n,) by the solution of factor factor^T y = x."""
     for i in range(n):
         for k in range(i):
@@ -43,7 +45,7 @@ def _solve_factored(factor, n, x):
         x[i] /= factor[i, i]
 
 
-@inner(allocates=True)
+@inner
 def _solve_subset(gram, rhs, active, x, work):
     """Solve gram x = rhs over the active unknowns; the others are zero."""
     n = rhs.size
@@ -56,19 +58,16 @@ def _solve_subset(gram, rhs, active, x, work):
             if active[j]:
                 work[count, column] = gram[i, j]
                 column += 1
-        work[count, n] = rhs[i]
+        x[count] = rhs[i]
         count += 1
-    _factor(work, count)
-    solution = np.empty(count)
-    for i in range(count):
-        solution[i] = work[i, n]
-    _solve_factored(work, count, solution)
-    count = 0
-    for i in range(n):
-        x[i] = 0.0
+    cholesky(work, count, 1e-14)
+    solve_factored(work, count, x)
+    for i in range(n - 1, -1, -1):
         if active[i]:
-            x[i] = solution[count]
-            count += 1
+            count -= 1
+            x[i] = x[count]
+        else:
+            x[i] = 0.0
 
 
 @inner
@@ -97,12 +96,12 @@ def _steepest(gram, rhs, active, x):
 
 
 @inner
-def _solve_fluxes(gram, rhs, signed, x, active, work):
+def solve_non_negative(gram, rhs, signed, x, active, work):
     """
     Solve min |G x - z| with x >= 0, unless signed.
 
     gram is G^T G, rhs G^T z. Lawson and Hanson's active set, started from
-    all unknowns free. work is (n, n + 1).
+    all unknowns free. active (n,) and work (n, n) are scratch.
     """
     n = rhs.size
     for i in range(n):
@@ -185,21 +184,23 @@ def _solve(factor, scale, size, vector):
 
 
 @inner
-def _eliminate(normal, n, size):
+def eliminate(normal, n, size):
     """Eliminate the first n unknowns from the upper triangle, in place."""
     for k in range(n):
-        pivot = normal[k, k]
+        upper = normal[k]
+        pivot = upper[k]
         if not pivot > 0:
             continue
-        for i in range(k + 1, size):
-            factor = normal[k, i] / pivot
+        for i in range(k + 1, min(size, normal.shape[0])):
+            factor = upper[i] / pivot
             if factor != 0:
+                row = normal[i]
                 for j in range(i, size):
-                    normal[i, j] -= factor * normal[k, j]
+                    row[j] -= factor * upper[j]
 
 
 @inner
-def _back_substitute(normal, n, size, step):
+def back_substitute(normal, n, size, step):
     """Solve for the first n unknowns after their elimination."""
     for k in range(n - 1, -1, -1):
         right = normal[k, size - 1]
@@ -217,28 +218,21 @@ def solve(augmented, step):
     triangle is read, and destroyed.
     """
     n = step.size
-    for k in range(n):
-        pivot = augmented[k, k]
-        if not pivot > 0:
-            continue
-        upper = augmented[k]
-        for i in range(k + 1, n):
-            factor = upper[i] / pivot
-            row = augmented[i]
-            for j in range(i, n + 1):
-                row[j] -= factor * upper[j]
-    _back_substitute(augmented, n, n + 1, step)
+    eliminate(augmented, n, n + 1)
+    back_substitute(augmented, n, n + 1, step)
 
 
 @inner
-def _invert_3x3(a, out):
+def invert_3x3(a, out):
     """Invert a symmetric matrix; zeros if it is not positive definite."""
     c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[1, 2]
     c01 = a[0, 2] * a[1, 2] - a[0, 1] * a[2, 2]
     c02 = a[0, 1] * a[1, 2] - a[0, 2] * a[1, 1]
     det = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
     if not det > 1e-12 * a[0, 0] * a[1, 1] * a[2, 2]:
-        out[:] = 0
+        for i in range(3):
+            for j in range(3):
+                out[i, j] = 0.0
         return
     out[0, 0] = c00 / det
     out[0, 1] = out[1, 0] = c01 / det
@@ -248,45 +242,24 @@ def _invert_3x3(a, out):
     out[2, 2] = (a[0, 0] * a[1, 1] - a[0, 1] * a[0, 1]) / det
 
 
-@inner
-def _cholesky(a, n):
-    """Factor a[:n, :n] in place; False where it is not positive definite."""
-    for i in range(n):
-        for j in range(i + 1):
-            total = a[i, j]
-            for k in range(j):
-                total -= a[i, k] * a[j, k]
-            if i == j:
-                if not total > 1e-12:
-                    return False
-                a[i, i] = sqrt(total)
-            else:
-                a[i, j] = total / a[j, j]
-    return True
-
-
-@inner
-def _factor_inverse_columns(a, n, first, count, out):
-    """
-    Put columns first, ... of inverse(L L^T) into out[:n, :count].
-
-    a holds L below and on its diagonal.
-    """
-    for c in range(count):
-        for i in range(n):
-            total = 1.0 if i == first + c else 0.0
-            for k in range(i):
-                total -= a[i, k] * out[k, c]
-            out[i, c] = total / a[i, i]
-        for i in range(n - 1, -1, -1):
-            total = out[i, c]
-            for k in range(i + 1, n):
-                total -= a[k, i] * out[k, c]
-            out[i, c] = total / a[i, i]
-
-
 # Plain loops: the same as a statement about whole arrays, with its check of
 # shapes, takes seconds to compile.
+
+@inner
+def clear(values, n):
+    """Make the first n numbers zero."""
+    for i in range(n):
+        values[i] = 0.0
+
+
+@inner
+def sum_of(values):
+    """Return the sum of numbers, in their order."""
+    result = 0.0
+    for i in range(values.size):
+        result += values[i]
+    return result
+
 
 @inner
 def copy_vector(source, n, target):

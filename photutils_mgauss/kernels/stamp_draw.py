@@ -8,13 +8,14 @@ from photutils_mgauss.kernels.gaussian import (
     NOTHING,
     fast_exp,
 )
-from photutils_mgauss.kernels.jit import inner, kernel
+from photutils_mgauss.kernels.jit import inner
+from photutils_mgauss.kernels.linear import clear
 from photutils_mgauss.kernels.rows import add_row
 
 _LOG_2PI = float(np.log(2 * np.pi))
 
 
-@kernel
+@inner
 def draw_unit(shapes, cx, cy, lanes, images):
     """
     Put Gaussians of unit flux into images (K, ny, nx).
@@ -57,7 +58,7 @@ def _draw_by_rows(shape, cx, cy, image):
     peak = exp(log_l + log_m - _LOG_2PI)
     for j in range(image.shape[0]):
         row = image[j]
-        row[:] = 0.0
+        clear(row, row.size)
         v = j - cy - my
         q = m * m * v * v
         if q < LOG_NOTHING:
@@ -113,7 +114,8 @@ def _walk_columns(start, end, way, fall, value, quotient, image):
 def _columns_of_product(a, b, weight, cy, columns):
     """Put sum_y w a b y^m into columns[m, x], m <= 4."""
     ny, nx = a.shape
-    columns[:] = 0.0
+    for m in range(5):
+        clear(columns[m], nx)
     c0, c1, c2 = columns[0], columns[1], columns[2]
     c3, c4 = columns[3], columns[4]
     # Two rows at once: a sum is loaded and stored half as often.
@@ -178,7 +180,8 @@ def low_moments(a, b, centre, columns, sums):
     columns (at least 3, nx) is scratch.
     """
     c0, c1, c2 = columns[0], columns[1], columns[2]
-    c0[:], c1[:], c2[:] = 0.0, 0.0, 0.0
+    for m in range(3):
+        clear(columns[m], c0.size)
     for j in range(a.shape[0]):
         v = j - centre[1]
         v2 = v * v
@@ -208,7 +211,8 @@ def derivative_polynomials(shape, out):
     # a = length x + t y + a0, b = m y + b0.
     a0 = -length * mx - t * my
     b0 = -m * my
-    out[:] = 0.0
+    for i in range(6):
+        clear(out[i], 6)
     out[0, 0] = 1.0
     out[1, 0], out[1, 1], out[1, 2] = length * a0, length * length, length * t
     out[2, 0] = t * a0 + m * b0
@@ -245,14 +249,15 @@ def contract(left, moments, right, half, out):
     left and right (6, 6) are the polynomials of the two Gaussians; half
     (6, 6) is scratch.
     """
-    half[:] = 0.0
+    for i in range(6):
+        clear(half[i], 6)
+        clear(out[i], 6)
     for a in range(6):
         for c in range(6):
             moment = moments[_POWER_X[a] + _POWER_X[c],
                              _POWER_Y[a] + _POWER_Y[c]]
             for j in range(6):
                 half[a, j] += moment * right[j, c]
-    out[:] = 0.0
     for i in range(6):
         for a in range(6):
             for j in range(6):

@@ -1,15 +1,16 @@
 """Least-squares fits of mixtures to an image of the PSF."""
 from math import exp
+from typing import NamedTuple
 
 import numpy as np
 
 from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import (
-    _factor,
-    _solve_factored,
-    _solve_fluxes,
-    copy_matrix,
-    copy_vector,
+    cholesky,
+    clear,
+    solve_factored,
+    solve_non_negative,
+    sum_of,
 )
 from photutils_mgauss.kernels.stamp_draw import (
     contract,
@@ -35,13 +36,90 @@ from photutils_mgauss.kernels.stamp_draw import (
 # shapes move along the Jacobian projected off them (variable projection in
 # Kaufman's form); the joint normal matrix with undamped fluxes does both.
 
-_LOG_2PI = float(np.log(2 * np.pi))
-
 # Rows of `limits`, see `penalty`.
 _NARROW, _WIDE, _REACH_X, _REACH_Y, _STIFFNESS = range(5)
 
-# What fit_stamp returns.
+# The damping that fits start with, of the diagonal, the least one, and one
+# so large that no step is left.
+_FIRST_DAMPING = 1e-2
+_LEAST_DAMPING = 1e-15
+_MOST_DAMPING = 1e12
+
+# Fits end where a step promises less than this fraction of the cost.
+_LEAST_GAIN = 1e-14
+
+# What fits return.
 FIT_CONVERGED, FIT_STOPPED = range(2)
+
+
+class StampTarget(NamedTuple):
+    """
+    What a mixture is fitted to, and how.
+
+    ``pixels``, ``weight`` (ny, nx); a weight of 0 leaves a pixel out, whatever
+    finite number is in it. ``centre`` (2,) is the pixel x, y to which means
+    are relative. ``tie`` (2,) is the total flux and the weight of that
+    condition (0: free), ``signed`` whether fluxes may be negative, ``rows``
+    (m, ny, nx) sums over the residual whose squares are part of the cost,
+    ``fixed_means`` whether means stay as they are, ``limits`` (5,) those of
+    `penalty`.
+    """
+
+    pixels: np.ndarray
+    weight: np.ndarray
+    centre: np.ndarray
+    tie: tuple
+    signed: bool
+    rows: np.ndarray
+    fixed_means: bool
+    limits: np.ndarray
+
+
+class StampScratch(NamedTuple):
+    """
+    The memory in which kernels fit K Gaussians to stamps (ny, nx).
+
+    `project` leaves the ``images`` (K, ny, nx) of unit flux and the
+    ``residual`` (ny, nx) here, `normal_equations` the ``matrix`` (6K, 6K) and
+    the ``gradient`` (6K,), and ``price`` (1,) is that of limits.
+    """
+
+    images: np.ndarray
+    residual: np.ndarray
+    weighted: np.ndarray
+    gram: np.ndarray
+    rhs: np.ndarray
+    gram_factor: np.ndarray
+    active: np.ndarray
+    columns: np.ndarray
+    polynomials: np.ndarray
+    sums: np.ndarray
+    moments: np.ndarray
+    half: np.ndarray
+    block: np.ndarray
+    matrix: np.ndarray
+    factor: np.ndarray
+    gradient: np.ndarray
+    step: np.ndarray
+    trial: np.ndarray
+    trial_fluxes: np.ndarray
+    slopes: np.ndarray
+    price: np.ndarray
+
+    @classmethod
+    def empty(cls, k, shape):
+        """Return the memory for K Gaussians and stamps of a shape."""
+        n = 6 * k
+        return cls(
+            images=np.empty((k, *shape)), residual=np.empty(shape),
+            weighted=np.empty(shape), gram=np.empty((k, k)), rhs=np.empty(k),
+            gram_factor=np.empty((k, k)), active=np.empty(k, bool),
+            columns=np.empty((5, shape[1])), polynomials=np.empty((k, 6, 6)),
+            sums=np.empty(6), moments=np.empty((5, 5)), half=np.empty((6, 6)),
+            block=np.empty((6, 6)), matrix=np.empty((n, n)),
+            factor=np.empty((n, n)), gradient=np.empty(n), step=np.empty(n),
+            trial=np.empty((k, 5)), trial_fluxes=np.empty(k),
+            slopes=np.empty(n), price=np.empty(1))
 
 
 @inner
@@ -56,8 +134,8 @@ def _hinge(excess, slopes, stiffness, matrix, gradient):
     return stiffness * excess * excess
 
 
-@kernel(allocates=True)
-def penalty(shape, limits, matrix, gradient):
+@inner
+def penalty(shape, limits, slopes, matrix, gradient):
     """
     Return the price of a Gaussian outside its limits.
 
@@ -65,12 +143,13 @@ def penalty(shape, limits, matrix, gradient):
     than the pixels can show) and of its projections (not wider than the
     stamp), and for its mean (on the stamp). Inside them the price is zero; it
     grows with the square of the excess. matrix (5, 5) and gradient (5,)
-    receive its share of the normal equations.
+    receive its share of the normal equations; slopes (at least 5,) is scratch.
     """
     x, y, log_l, t, log_m = shape
     m = exp(log_m)
     stiffness = limits[_STIFFNESS]
-    slopes = np.zeros(5)
+    for i in range(5):
+        slopes[i] = 0.0
     slopes[2] = 1.0
     price = _hinge(log_l + limits[_NARROW], slopes, stiffness, matrix,
                    gradient)
@@ -107,36 +186,44 @@ def _residual(stamp, images, fluxes, out):
                 out[j, i] -= fluxes[k] * images[k, j, i]
 
 
-@kernel
-def project(stamp, weight, centre, shapes, tie, signed, rows, fluxes,
-            scratch):
+@inner
+def project(target, shapes, fluxes, scratch):
     """
     Put the best fluxes for the shapes into fluxes; return the chi square.
 
-    tie is the total flux and the weight of that condition (0: free). rows
-    (m, ny, nx) are sums over the residual whose squares count too; m may be
-    0. The images and the residual are left in scratch.
+    The images and the residual are left in scratch.
     """
-    images, residual, _, gram, rhs, work, active, lanes = scratch[:8]
-    total, tie_weight = tie
-    draw_unit(shapes, centre[0], centre[1], lanes[:4], images)
-    n = fluxes.size
-    for k in range(n):
-        rhs[k] = (_weighted_dot(images[k], stamp, weight, lanes[0])
+    images, residual = scratch.images, scratch.residual
+    lane = scratch.columns[0]
+    draw_unit(shapes, target.centre[0], target.centre[1], scratch.columns[:4],
+              images)
+    _flux_equations(target, scratch)
+    solve_non_negative(scratch.gram, scratch.rhs, target.signed, fluxes,
+                       scratch.active, scratch.gram_factor)
+    _residual(target.pixels, images, fluxes, residual)
+    chi2 = _weighted_dot(residual, residual, target.weight, lane)
+    for i in range(target.rows.shape[0]):
+        chi2 += _dot(target.rows[i], residual, lane) ** 2
+    total, tie_weight = target.tie
+    lack = sum_of(fluxes) - total
+    return chi2 + tie_weight * lack * lack
+
+
+@inner
+def _flux_equations(target, scratch):
+    """Put the normal equations of the fluxes into gram and rhs."""
+    images, gram, rhs = scratch.images, scratch.gram, scratch.rhs
+    lane = scratch.columns[0]
+    total, tie_weight = target.tie
+    for k in range(rhs.size):
+        rhs[k] = (_weighted_dot(images[k], target.pixels, target.weight, lane)
                   + tie_weight * total)
         for other in range(k + 1):
             gram[k, other] = tie_weight + _weighted_dot(
-                images[k], images[other], weight, lanes[0])
+                images[k], images[other], target.weight, lane)
             gram[other, k] = gram[k, other]
-    if rows.shape[0] > 0:
-        _add_rows_to_fluxes(rows, stamp, images, lanes[0], gram, rhs)
-    _solve_fluxes(gram, rhs, signed, fluxes, active, work)
-    _residual(stamp, images, fluxes, residual)
-    chi2 = _weighted_dot(residual, residual, weight, lanes[0])
-    for row in rows:
-        chi2 += _dot(row, residual, lanes[0]) ** 2
-    lack = fluxes.sum() - total
-    return chi2 + tie_weight * lack * lack
+    if target.rows.shape[0] > 0:
+        _add_rows_to_fluxes(target, scratch)
 
 
 # Sums over pixels are taken column by column first: the compiler makes
@@ -145,52 +232,55 @@ def project(stamp, weight, centre, shapes, tie, signed, rows, fluxes,
 @inner
 def _weighted_dot(a, b, weight, lane):
     """Return sum_pixels w a b; lane (nx,) is scratch."""
-    lane[:] = 0.0
+    clear(lane, lane.size)
     for j in range(a.shape[0]):
         for i in range(lane.size):
             lane[i] += weight[j, i] * a[j, i] * b[j, i]
-    return lane.sum()
+    return sum_of(lane)
 
 
 @inner
 def _dot(a, b, lane):
     """Return sum_pixels a b; lane (nx,) is scratch."""
-    lane[:] = 0.0
+    clear(lane, lane.size)
     for j in range(a.shape[0]):
         for i in range(lane.size):
             lane[i] += a[j, i] * b[j, i]
-    return lane.sum()
+    return sum_of(lane)
 
 
-@inner(allocates=True)
-def _add_rows_to_fluxes(rows, stamp, images, lane, gram, rhs):
+@inner
+def _add_rows_to_fluxes(target, scratch):
     """Add rows (m, ny, nx) over the residual to the equations of fluxes."""
-    seen = np.empty(images.shape[0])
-    for row in rows:
-        want = _dot(row, stamp, lane)
-        for k in range(seen.size):
-            seen[k] = _dot(row, images[k], lane)
-        for k in range(seen.size):
+    seen, lane = scratch.slopes, scratch.columns[0]
+    gram, rhs = scratch.gram, scratch.rhs
+    for r in range(target.rows.shape[0]):
+        row = target.rows[r]
+        want = _dot(row, target.pixels, lane)
+        for k in range(rhs.size):
+            seen[k] = _dot(row, scratch.images[k], lane)
+        for k in range(rhs.size):
             rhs[k] += seen[k] * want
-            for other in range(seen.size):
+            for other in range(rhs.size):
                 gram[k, other] += seen[k] * seen[other]
 
 
-@inner(allocates=True)
-def _add_rows(rows, centre, residual, images, fluxes, polynomials, columns,
-              matrix, gradient):
+@inner
+def _add_rows(target, fluxes, scratch):
     """Add rows (m, ny, nx) over the residual to the normal equations."""
-    n = fluxes.size
-    sums, slopes = np.empty(6), np.empty(6 * n)
-    for row in rows:
-        left = _dot(row, residual, columns[0])
-        for k in range(n):
-            low_moments(row, images[k], centre, columns, sums)
-            _put_slopes(polynomials[k], sums, k, fluxes, slopes)
-        for i in range(6 * n):
+    slopes, gradient = scratch.slopes, scratch.gradient
+    for r in range(target.rows.shape[0]):
+        row = target.rows[r]
+        left = _dot(row, scratch.residual, scratch.columns[0])
+        for k in range(fluxes.size):
+            low_moments(row, scratch.images[k], target.centre,
+                        scratch.columns, scratch.sums)
+            _put_slopes(scratch.polynomials[k], scratch.sums, k, fluxes,
+                        slopes)
+        for i in range(slopes.size):
             gradient[i] += slopes[i] * left
-            for j in range(6 * n):
-                matrix[i, j] += slopes[i] * slopes[j]
+            for j in range(slopes.size):
+                scratch.matrix[i, j] += slopes[i] * slopes[j]
 
 
 @inner
@@ -203,37 +293,43 @@ def _put_slopes(polynomials, sums, k, fluxes, slopes):
         slopes[_unknown(fluxes.size, k, i)] = slope * (fluxes[k] if i else 1.0)
 
 
-@kernel
-def normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
-                     matrix, gradient):
+@inner
+def normal_equations(target, shapes, fluxes, scratch):
     """
     Put the normal equations into matrix (6K, 6K) and gradient (6K,).
 
     The unknowns are the K fluxes and five shape numbers for each Gaussian.
-    The images and the residual come from `project`.
+    The images and the residual come from `project`. Penalties are not added.
     """
-    images, residual, weighted = scratch[:3]
-    columns, polynomials, sums, moments, half, block = scratch[7:]
-    n = fluxes.size
+    weight, images = target.weight, scratch.images
+    polynomials = scratch.polynomials
     for j in range(weight.shape[0]):
         for i in range(weight.shape[1]):
-            weighted[j, i] = weight[j, i] * residual[j, i]
-    for k in range(n):
+            scratch.weighted[j, i] = weight[j, i] * scratch.residual[j, i]
+    for k in range(fluxes.size):
         derivative_polynomials(shapes[k], polynomials[k])
-        low_moments(images[k], weighted, centre, columns, sums)
-        _put_slopes(polynomials[k], sums, k, fluxes, gradient)
-    for k in range(n):
+        low_moments(images[k], scratch.weighted, target.centre,
+                    scratch.columns, scratch.sums)
+        _put_slopes(polynomials[k], scratch.sums, k, fluxes, scratch.gradient)
+    for k in range(fluxes.size):
         for other in range(k + 1):
-            moments_of_product(images[k], images[other], weight, centre[0],
-                                centre[1], columns, moments)
-            contract(polynomials[k], moments, polynomials[other], half,
-                      block)
-            _place(block, k, other, fluxes, matrix)
-            matrix[k, other] += tie[1]
-            matrix[other, k] = matrix[k, other]
-    if rows.shape[0] > 0:
-        _add_rows(rows, centre, residual, images, fluxes, polynomials,
-                  columns, matrix, gradient)
+            _add_pair(target, k, other, fluxes, scratch)
+    if target.rows.shape[0] > 0:
+        _add_rows(target, fluxes, scratch)
+
+
+@inner
+def _add_pair(target, k, other, fluxes, scratch):
+    """Write what two Gaussians share into the normal matrix."""
+    matrix = scratch.matrix
+    moments_of_product(scratch.images[k], scratch.images[other],
+                       target.weight, target.centre[0], target.centre[1],
+                       scratch.columns, scratch.moments)
+    contract(scratch.polynomials[k], scratch.moments,
+             scratch.polynomials[other], scratch.half, scratch.block)
+    _place(scratch.block, k, other, fluxes, matrix)
+    matrix[k, other] += target.tie[1]
+    matrix[other, k] = matrix[k, other]
 
 
 @inner
@@ -256,55 +352,49 @@ def _place(block, k, other, fluxes, matrix):
             matrix[column, row] = value
 
 
-@kernel
-def add_penalties(shapes, limits, matrix, gradient):
+@inner
+def _price(shapes, limits, slopes, matrix, gradient):
     """Add the limits to the normal equations; return their price."""
     n = shapes.shape[0]
     price = 0.0
     for k in range(n):
         first = n + 5 * k
-        price += penalty(shapes[k], limits,
-                          matrix[first:first + 5, first:first + 5],
-                          gradient[first:first + 5])
+        price += penalty(shapes[k], limits, slopes,
+                         matrix[first:first + 5, first:first + 5],
+                         gradient[first:first + 5])
     return price
 
 
 @inner
-def _step(matrix, gradient, fluxes, damping, fixed_means, factor, step):
+def _damp(fluxes, damping, fixed_means, scratch):
     """
-    Put the damped step of all unknowns into step (6K,).
+    Put the damped normal matrix into factor and the right side into step.
 
     The fluxes are not damped. A Gaussian without flux stands still. Returns
-    the predicted decrease of the cost.
+    what is added to the diagonal before it is damped.
     """
-    n = fluxes.size
-    size = gradient.size
+    n, size = fluxes.size, scratch.gradient.size
+    matrix, factor, step = scratch.matrix, scratch.factor, scratch.step
     floor = 0.0
     for i in range(n, size):
-        floor = max(floor, matrix[i, i])
+        floor = max(floor, 1e-9 * matrix[i, i])
     for i in range(size):
         k = i if i < n else (i - n) // 5
         still = fluxes[k] == 0 or (fixed_means and i >= n
                                    and (i - n) % 5 < 2)
-        step[i] = 0.0 if still else gradient[i]
+        step[i] = 0.0 if still else scratch.gradient[i]
         for j in range(i):
             other = j if j < n else (j - n) // 5
             factor[i, j] = (0.0 if still or fluxes[other] == 0
                             else matrix[i, j])
         factor[i, i] = matrix[i, i]
         if i >= n:
-            factor[i, i] += damping * (matrix[i, i] + 1e-9 * floor)
+            factor[i, i] += damping * (matrix[i, i] + floor)
         if still:
             factor[i, i] = 1.0
     if fixed_means:
         _uncouple_means(n, factor)
-    _factor(factor, size)
-    _solve_factored(factor, size, step)
-    gain = 0.0
-    for i in range(n, size):
-        gain += step[i] * (gradient[i] + damping * step[i]
-                           * (matrix[i, i] + 1e-9 * floor))
-    return gain
+    return floor
 
 
 @inner
@@ -314,6 +404,25 @@ def _uncouple_means(n, factor):
             i = n + 5 * k + c
             for j in range(i + 1, factor.shape[0]):
                 factor[j, i] = 0.0
+
+
+@inner
+def _find_step(fluxes, damping, fixed_means, scratch):
+    """
+    Put the damped step of all unknowns into step (6K,).
+
+    Returns the predicted decrease of the cost.
+    """
+    matrix, step = scratch.matrix, scratch.step
+    floor = _damp(fluxes, damping, fixed_means, scratch)
+    # A pivot lost to rounding stops its unknown instead of the fit.
+    cholesky(scratch.factor, step.size, 1e-14)
+    solve_factored(scratch.factor, step.size, step)
+    gain = 0.0
+    for i in range(fluxes.size, step.size):
+        gain += step[i] * (scratch.gradient[i] + damping * step[i]
+                           * (matrix[i, i] + floor))
+    return gain
 
 
 @inner
@@ -329,94 +438,86 @@ def _move(shapes, step, out):
 
 
 @inner
-def fit_shapes(stamp, weight, centre, shapes, fluxes, tie, signed, rows,
-               fixed_means, limits, tolerance, max_steps, scratch, matrices,
-               vectors):
+def _cost(target, shapes, fluxes, scratch):
+    """Return the cost of shapes; their fluxes are solved for."""
+    cost = project(target, shapes, fluxes, scratch)
+    # The equations of the last point may still be needed.
+    return cost + _price(shapes, target.limits, scratch.slopes,
+                         scratch.factor, scratch.step)
+
+
+@inner
+def _equations(target, shapes, fluxes, scratch):
+    """Put the normal equations into scratch, those of the limits, too."""
+    normal_equations(target, shapes, fluxes, scratch)
+    scratch.price[0] = _price(shapes, target.limits, scratch.slopes,
+                              scratch.matrix, scratch.gradient)
+
+
+@inner
+def _take_trial(scratch, shapes, fluxes):
+    """Make the trial the present point."""
+    for k in range(fluxes.size):
+        fluxes[k] = scratch.trial_fluxes[k]
+        for i in range(5):
+            shapes[k, i] = scratch.trial[k, i]
+
+
+@inner
+def _fit_shapes(target, shapes, fluxes, tolerance, max_steps, scratch):
     """
     Fit K Gaussians to a stamp by Levenberg-Marquardt, in place.
 
-    Parameters
-    ----------
-    stamp, weight : (ny, nx)
-        Pixels and their weights; a weight of 0 leaves a pixel out, whatever
-        finite number is in it.
-    centre : (2,)
-        The pixel x, y to which the means are relative.
-    shapes, fluxes : (K, 5), (K,)
-        Where to start (the fluxes are only written), and the result.
-    tie : (2,)
-        The total flux and the weight of that condition (0: free).
-    signed : bool
-        Whether fluxes may be negative.
-    rows : (m, ny, nx)
-        Sums over the residual whose squares are part of the cost.
-    fixed_means : bool
-        Whether means stay as they are.
-    limits : (5,)
-        See `penalty`.
-    tolerance, max_steps
-        Stop when two steps running lower the cost by less than this fraction,
-        or after so many steps.
-    scratch, matrices, vectors
-        From `fitting.Workspace`.
-
-    Returns
-    -------
-    cost, status, steps
+    Damping falls with the quality of a step, and grows ever faster while
+    steps fail (Nielsen 1999, IMM-REP-1999-05). Returns cost and status.
     """
-    matrix, factor = matrices
-    gradient, step, trial, trial_fluxes = vectors
-    idle_matrix, idle_gradient = factor, step
-    cost = project(stamp, weight, centre, shapes, tie, signed, rows, fluxes,
-                   scratch)
-    if max_steps > 0:
-        normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
-                         matrix, gradient)
-    cost += add_penalties(shapes, limits, matrix, gradient)
-    damping, growth, small = 1e-2, 2.0, 0
+    cost = _cost(target, shapes, fluxes, scratch)
+    _equations(target, shapes, fluxes, scratch)
+    damping, growth, n_small = _FIRST_DAMPING, 2.0, 0
     for n_steps in range(1, max_steps + 1):
-        gain = _step(matrix, gradient, fluxes, damping, fixed_means, factor,
-                     step)
-        _move(shapes, step, trial)
-        trial_cost = project(stamp, weight, centre, trial, tie, signed, rows,
-                             trial_fluxes, scratch)
-        trial_cost += add_penalties(trial, limits, idle_matrix,
-                                     idle_gradient)
-        if not trial_cost < cost:
+        gain = _find_step(fluxes, damping, target.fixed_means, scratch)
+        _move(shapes, scratch.step, scratch.trial)
+        trial_cost = _cost(target, scratch.trial, scratch.trial_fluxes,
+                           scratch)
+        fall = cost - trial_cost
+        if not fall > 0:
             damping *= growth
             growth *= 2
-            if damping > 1e12 or not gain > 1e-14 * cost:
-                return cost, FIT_CONVERGED, n_steps
+            if damping > _MOST_DAMPING or not gain > _LEAST_GAIN * cost:
+                return cost, FIT_CONVERGED
             continue
-        drop = cost - trial_cost
-        copy_matrix(trial, trial.shape[0], trial.shape[1], shapes)
-        copy_vector(trial_fluxes, trial_fluxes.size, fluxes)
-        small = small + 1 if drop <= tolerance * cost else 0
+        _take_trial(scratch, shapes, fluxes)
+        n_small = n_small + 1 if fall <= tolerance * cost else 0
         cost = trial_cost
-        if small >= 2:
-            return cost, FIT_CONVERGED, n_steps
-        if n_steps == max_steps:
-            break
-        normal_equations(weight, centre, shapes, fluxes, tie, rows, scratch,
-                         matrix, gradient)
-        add_penalties(shapes, limits, matrix, gradient)
-        quality = 2 * drop / max(gain, 1e-300) - 1
-        damping = max(damping * max(0.2, 1 - quality ** 3), 1e-15)
+        if n_small >= 2:
+            return cost, FIT_CONVERGED
+        if n_steps < max_steps:
+            _equations(target, shapes, fluxes, scratch)
+        quality = 2 * fall / max(gain, 1e-300) - 1
+        damping = max(damping * max(0.2, 1 - quality ** 3), _LEAST_DAMPING)
         growth = 2.0
-    return cost, FIT_STOPPED, max_steps
+    return cost, FIT_STOPPED
 
 
 @kernel
-def fit_starts(stamp, weight, centre, shapes, fluxes, tie, signed, rows,
-               fixed_means, limits, tolerance, max_steps, scratch, matrices,
-               vectors, costs, statuses):
+def fit_starts(target, shapes, fluxes, tolerance, max_steps, scratch, costs,
+               statuses):
     """
-    Do `fit_shapes` from each of several starts, in place.
+    Fit K Gaussians to a stamp from each of several starts, in place.
 
-    shapes is (n, K, 5), fluxes (n, K); costs and statuses (n,) are written.
+    Parameters
+    ----------
+    target : StampTarget
+    shapes, fluxes : (n, K, 5), (n, K)
+        Where to start (fluxes are only written), and the results.
+    tolerance, max_steps
+        Stop when two steps running lower the cost by less than this fraction,
+        or after so many steps. Without steps the images, the normal equations
+        and the price of limits at the last start are left in scratch.
+    scratch : StampScratch
+    costs, statuses : (n,)
+        Are written.
     """
     for i in range(costs.size):
-        costs[i], statuses[i], _ = fit_shapes(
-            stamp, weight, centre, shapes[i], fluxes[i], tie, signed, rows,
-            fixed_means, limits, tolerance, max_steps, scratch, matrices,
-            vectors)
+        costs[i], statuses[i] = _fit_shapes(
+            target, shapes[i], fluxes[i], tolerance, max_steps, scratch)

@@ -10,6 +10,7 @@ from photutils_mgauss.kernels.gaussian import (
 )
 from photutils_mgauss.kernels.grid import blend_weights
 from photutils_mgauss.kernels.jit import inner, kernel, loop
+from photutils_mgauss.kernels.linear import clear
 
 # The PSF of a star and its derivatives by position are summed in a tile, one
 # flat array: for each pixel column LANES values of the PSF, as many of its
@@ -136,13 +137,6 @@ def add_gaussian(a, dx, dy, p, s, q, stride, by_x, by_y, integrated, height,
     elif _walk_starts(a, dx - s * dy, dy, p, s, q, stride, by_x, by_y, height,
                       walk):
         _add_walk(p, s, stride[3], width, walk, tile)
-
-
-@inner
-def clear(values, n):
-    """Make the first n of values zero."""
-    for i in range(n):
-        values[i] = 0.0
 
 
 @inner

@@ -7,6 +7,7 @@ from astropy.io import fits
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
+from helpers.compiled import compiled
 from photutils_mgauss import (
     FitStatus,
     GaussianMixture,
@@ -15,7 +16,16 @@ from photutils_mgauss import (
     kernels,
 )
 from photutils_mgauss.fitting.phases import phase_error, phase_rows
-from photutils_mgauss.fitting.search import Workspace
+from photutils_mgauss.fitting.search import workspace
+from photutils_mgauss.kernels.stamp_draw import draw_unit
+from photutils_mgauss.kernels.stamp_fit import (
+    normal_equations,
+    penalty,
+    project,
+)
+
+DRAW_UNIT, NORMAL_EQUATIONS, PENALTY, PROJECT = map(
+    compiled, (draw_unit, normal_equations, penalty, project))
 
 TRUTH = GaussianMixture.from_stddevs(
     [0.55, 0.35, 0.1], [[0.1, -0.05], [-0.2, 0.1], [0.3, 0.4]],
@@ -92,15 +102,16 @@ def test_the_normal_equations_are_those_of_finite_differences(rng, n_rows):
                               -np.log([1.5, 2, 3]), rng.normal(0, 0.2, k),
                               -np.log([1.3, 2.5, 3])])
     weight, stamp = rng.uniform(0.5, 2, shape), rng.normal(0, 1, shape)
-    fluxes, space = np.empty(k), Workspace(k, shape)
+    fluxes, space = np.empty(k), workspace(k, shape)
     rows = rng.normal(0, 1, (n_rows, *shape))
-    kernels.project(stamp, weight, centre, shapes, (0.0, 0.0), True, rows,
-                    fluxes, space.scratch)
+    target = kernels.StampTarget(stamp, weight, centre, (0.0, 0.0), True,
+                                 rows, False, np.empty(5))
+    PROJECT(target, shapes, fluxes, space)
 
     def residual(values):
         images = np.empty((k, *shape))
-        kernels.draw_unit(values[k:].reshape(k, 5), *centre,
-                          np.empty((4, shape[1])), images)
+        DRAW_UNIT(values[k:].reshape(k, 5), *centre,
+                  np.empty((4, shape[1])), images)
         model = np.tensordot(values[:k], images, 1)
         left = stamp - model
         return np.concatenate([(np.sqrt(weight) * left).ravel(),
@@ -110,9 +121,8 @@ def test_the_normal_equations_are_those_of_finite_differences(rng, n_rows):
     step = 1e-6 * np.eye(values.size)
     jacobian = np.array([residual(values + h) - residual(values - h)
                          for h in step]) / 2e-6
-    matrix, gradient = np.empty((6 * k, 6 * k)), np.empty(6 * k)
-    kernels.normal_equations(weight, centre, shapes, fluxes, (0.0, 0.0),
-                             rows, space.scratch, matrix, gradient)
+    NORMAL_EQUATIONS(target, shapes, fluxes, space)
+    matrix, gradient = space.matrix, space.gradient
     assert_allclose(matrix, jacobian @ jacobian.T, rtol=1e-6,
                     atol=1e-7 * matrix.max())
     assert_allclose(gradient, -jacobian @ residual(values), rtol=1e-6,
@@ -125,11 +135,11 @@ def test_the_price_of_limits_has_the_slope_it_says(rng):
     limits = np.array([0.5, 1.0, 3.0, 4.0, 2.0])
     for shape in rng.normal(0, 4, (50, 5)):
         gradient = np.zeros(5)
-        kernels.penalty(shape, limits, np.zeros((5, 5)), gradient)
+        PENALTY(shape, limits, np.empty(5), np.zeros((5, 5)), gradient)
         step = 1e-6 * np.eye(5)
-        rest = np.zeros((5, 5)), np.zeros(5)
-        slope = [(kernels.penalty(shape + h, limits, *rest)
-                  - kernels.penalty(shape - h, limits, *rest)) / 2e-6
+        rest = np.empty(5), np.zeros((5, 5)), np.zeros(5)
+        slope = [(PENALTY(shape + h, limits, *rest)
+                  - PENALTY(shape - h, limits, *rest)) / 2e-6
                  for h in step]
         assert_allclose(gradient, -np.array(slope) / 2, rtol=1e-5, atol=1e-5)
 
@@ -442,7 +452,7 @@ def test_astrometric_weighting_needs_more_than_native_pixels():
 def test_gaussians_are_drawn_as_they_are_defined(tilt, width, mean):
     shapes = np.array([[*mean, -np.log(width), tilt, -np.log(1.3 * width)]])
     images = np.empty((1, 23, 40))
-    kernels.draw_unit(shapes, 19.5, 11.0, np.empty((4, 40)), images)
+    DRAW_UNIT(shapes, 19.5, 11.0, np.empty((4, 40)), images)
     y, x = np.indices(images.shape[1:])
     u, v = x - 19.5 - mean[0], y - 11.0 - mean[1]
     exponent = (u / width + tilt * v)**2 + (v / (1.3 * width))**2
