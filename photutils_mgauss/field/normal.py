@@ -182,12 +182,14 @@ class _PartEquations:
             now = self.coefficients, basis[part], local[part]
             rows = kernel_rows_of_logs(*self.form.shapes(*now))
             n = 3 * sources.shape[1] + 6 * rows.shape[1] - 1
+            stars = kernels.FieldStars(*(column[part] for column in (
+                data, weights, corners, sources, anchors, hold, n_sources,
+                sky, used)))
             kernels.field_normal(
-                data[part], weights[part], corners[part], basis[part], rows,
-                self.form.jacobians(*now), sources[part], anchors[part],
-                hold[part], n_sources[part], sky[part], self.fit_sky,
-                used[part], _SETTLE_STEPS, np.empty((n, n)), total, right,
-                chi2[part])
+                stars, kernels.FieldShapes(basis[part], rows,
+                                           self.form.jacobians(*now)),
+                self.fit_sky, _SETTLE_STEPS, np.empty((n, n)),
+                kernels.FieldSums(total, right, chi2[part]))
         return Equations(total, right, chi2, sources, sky)
 
 

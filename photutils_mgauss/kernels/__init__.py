@@ -50,6 +50,9 @@ __getattr__, __dir__, __all__ = hand_on(__name__, {
     'POOR_GAIN': 'descent',
     'next_damping': 'descent',
     'remainder': 'descent',
+    'FieldShapes': 'field_fit',
+    'FieldStars': 'field_fit',
+    'FieldSums': 'field_fit',
     'field_model': 'field_fit',
     'field_normal': 'field_fit',
     'evaluate': 'gaussian',
@@ -84,5 +87,4 @@ __getattr__, __dir__, __all__ = hand_on(__name__, {
     'fit_stars': 'star_fit',
     'star_equations': 'star_fit',
     'star_derivatives': 'star_fit',
-    'strides': 'tile',
 })

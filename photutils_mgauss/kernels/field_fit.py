@@ -1,5 +1,6 @@
 """A field of mixtures fitted to the stamps of stars."""
 from math import exp, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,54 @@ from photutils_mgauss.kernels.rows import render
 # residual, all in one triangle: eliminating the first Q is a Schur complement
 # that leaves the equations of the shapes, their right side and chi^2.
 
-_TWO_PI = 2 * np.pi
+
+
+class FieldStars(NamedTuple):
+    """
+    The stamps of n stars and the numbers of their own.
+
+    stamps, weights (n, s, s); corners (n, 2), the pixel (x, y) of each
+    stamp's first; sources, anchors, hold (n, M, 3), of which n_sources (n,)
+    count: where sources are, where neighbours are expected, and the precision
+    of that; sky (n,); used (n,), which stars the PSF is fitted to.
+    """
+
+    stamps: np.ndarray
+    weights: np.ndarray
+    corners: np.ndarray
+    sources: np.ndarray
+    anchors: np.ndarray
+    hold: np.ndarray
+    n_sources: np.ndarray
+    sky: np.ndarray
+    used: np.ndarray
+
+
+class FieldShapes(NamedTuple):
+    """
+    The PSF of each of n stars, rows (n, K, 6), and what it depends on.
+
+    basis (n, T), the polynomials at the star; jacobians (n, 6 K - 3, P), the
+    derivatives of its shapes by the P numbers that are polynomials, or
+    (0, 0, 0) if they are the shapes themselves.
+    """
+
+    basis: np.ndarray
+    rows: np.ndarray
+    jacobians: np.ndarray
+
+
+class FieldSums(NamedTuple):
+    """
+    Normal equations of a field, and chi2 (n,) of each star.
+
+    total (P T, P T), upper triangle, and gradient (P T,) order unknowns by
+    number, then term.
+    """
+
+    total: np.ndarray
+    gradient: np.ndarray
+    chi2: np.ndarray
 
 
 @inner
@@ -156,47 +204,48 @@ def _shift_sources(sources, n_sources, sky, fit_sky, step):
     return sky
 
 
+@inner
+def _settle(i, stars, rows, fit_sky, with_shapes, block, normal, step):
+    """Take a Gauss-Newton step of a star's own numbers, the PSF given."""
+    left, bottom = stars.corners[i]
+    sources, n_sources = stars.sources[i], stars.n_sources[i]
+    size = _accumulate(stars.stamps[i], stars.weights[i], left, bottom, rows,
+                       sources, n_sources, stars.sky[i], fit_sky, with_shapes,
+                       block, normal)
+    _hold_neighbours(sources, stars.anchors[i], n_sources, stars.hold[i],
+                     size, normal)
+    own = 3 * n_sources + fit_sky
+    eliminate(normal, own, size)
+    back_substitute(normal, own, size, step)
+    stars.sky[i] = _shift_sources(sources, n_sources, stars.sky[i], fit_sky,
+                                  step)
+    return size
+
+
 @kernel(allocates=True)
-def field_normal(stamps, weights, corners, basis, rows, jacobians, sources,
-                 anchors, hold, n_sources, sky, fit_sky, used, n_steps,
-                 normal, total, gradient, chi2):
+def field_normal(stars, shapes, fit_sky, n_steps, normal, sums):
     """
-    Settle n stars and add the equations of the used ones to total, gradient.
+    Settle n stars and add the equations of the used ones to sums.
 
     Each star's own numbers take n_steps Gauss-Newton steps, the PSF given;
     the last one is taken together with the equations of the shapes, so that
-    chi2 (n,) and gradient are those after it.
-
-    stamps, weights (n, s, s); corners (n, 2), the pixel (x, y) of each
-    stamp's first; basis (n, T); rows (n, K, 6), the PSF of each star;
-    jacobians (n, 6 K - 3, P), the derivatives of its shapes by the P numbers
-    that are polynomials, or (0, 0, 0) if they are the shapes themselves;
-    sources, anchors, hold (n, M, 3); n_sources (n,); sky (n,) with fit_sky;
-    used (n,). normal is scratch (D, D) with D = 3 M + 6 K - 1. total
-    (P T, P T), upper triangle, and gradient (P T,) order unknowns by number,
-    then term.
+    chi2 and gradient are those after it. sources and, with fit_sky, sky of
+    the stars change. normal is scratch (D, D) with D = 3 M + 6 K - 1.
     """
+    basis, rows, jacobians = shapes
+    total, gradient, chi2 = sums
     block = np.empty((4, normal.shape[0]))
     step = np.empty(normal.shape[0])
     spread = np.empty(gradient.size)
     condensed = np.empty((jacobians.shape[2], jacobians.shape[2] + 1))
-    for star in range(stamps.shape[0]):
-        left, bottom = corners[star]
-        own = 3 * n_sources[star] + fit_sky
+    for star in range(chi2.size):
+        used = stars.used[star]
+        own = 3 * stars.n_sources[star] + fit_sky
         for i in range(n_steps):
-            last = used[star] and i == n_steps - 1
-            size = _accumulate(
-                stamps[star], weights[star], left, bottom, rows[star],
-                sources[star], n_sources[star], sky[star], fit_sky, last,
-                block, normal)
-            _hold_neighbours(sources[star], anchors[star], n_sources[star],
-                             hold[star], size, normal)
-            eliminate(normal, own, size)
-            back_substitute(normal, own, size, step)
-            sky[star] = _shift_sources(sources[star], n_sources[star],
-                                       sky[star], fit_sky, step)
+            size = _settle(star, stars, rows[star], fit_sky,
+                           used and i == n_steps - 1, block, normal, step)
         chi2[star] = normal[size - 1, size - 1]
-        if not used[star]:
+        if not used:
             continue
         if jacobians.size:
             _condense(normal, own, size, jacobians[star], condensed)
@@ -250,7 +299,9 @@ def field_model(corners, rows, sources, n_sources, sky, out):
     """Put model stamps of n stars, neighbours and sky included, into out."""
     for star in range(out.shape[0]):
         left, bottom = corners[star]
-        out[star] = sky[star]
+        for j in range(out.shape[1]):
+            for i in range(out.shape[2]):
+                out[star, j, i] = sky[star]
         for j in range(n_sources[star]):
             x, y, flux = sources[star, j]
             render(rows[star], x - left, y - bottom, flux, False, out[star])

@@ -7,6 +7,7 @@ kept on disk with all that it calls. A function that only kernels call is
 once, together with theirs; it has no wrapper, no file and no machine code of
 its own. A `loop` is an inner function that is optimised by itself first.
 """
+import gc
 import logging
 import pickle
 import sys
@@ -29,6 +30,10 @@ _OPTIONS = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
 
 # Compiling that takes longer than this is told to whoever waits [s].
 _PATIENCE = 1.0
+
+# Looking for garbage among all objects takes a tenth of the time of compiling,
+# which makes many objects and little garbage: a threshold that is not reached.
+_SELDOM = 1_000_000
 
 # What reading a damaged file of compiled code may raise.
 _UNREADABLE = (OSError, EOFError, ValueError, TypeError, AttributeError,
@@ -169,10 +174,14 @@ class _Wait:
         self._seconds = 0.0
         self._start = None
         self._timer = None
+        self._thresholds = gc.get_threshold()
 
     def begin(self):
         """Compiling starts, of a kernel or of one that it calls."""
         self._depth += 1
+        if self._depth == 1:
+            self._thresholds = gc.get_threshold()
+            gc.set_threshold(*self._thresholds[:2], _SELDOM)
         if self._depth == 1 and self._seconds < _PATIENCE:
             self._start = time.monotonic()
             self._timer = threading.Timer(_PATIENCE - self._seconds, _say)
@@ -182,6 +191,8 @@ class _Wait:
     def end(self):
         """Compiling has ended."""
         self._depth = max(self._depth - 1, 0)
+        if self._depth == 0:
+            gc.set_threshold(*self._thresholds)
         if self._depth == 0 and self._timer is not None:
             self._timer.cancel()
             self._timer = None

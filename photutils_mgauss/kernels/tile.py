@@ -9,7 +9,7 @@ from photutils_mgauss.kernels.gaussian import (
     point_value,
 )
 from photutils_mgauss.kernels.grid import blend_weights
-from photutils_mgauss.kernels.jit import inner, kernel, loop
+from photutils_mgauss.kernels.jit import inner, loop
 from photutils_mgauss.kernels.linear import clear
 
 # The PSF of a star and its derivatives by position are summed in a tile, one
@@ -25,24 +25,6 @@ LANES = 16
 _LEAST_SHARE = 1e-30
 
 
-@kernel
-def strides(nodes, out):
-    """
-    Put the constant factors of walks over Gaussians into out (M, K, 4).
-
-    The precision along y at fixed x; how the quotient of columns grows from
-    row to row; how the quotients of rows, and of columns, fall.
-    """
-    for m in range(nodes.shape[0]):
-        for k in range(nodes.shape[1]):
-            _, _, _, p, s, q = nodes[m, k]
-            t = q + s * s * p
-            out[m, k, 0] = t
-            out[m, k, 1] = exp(p * s)
-            out[m, k, 2] = exp(-t)
-            out[m, k, 3] = exp(-p)
-
-
 @loop
 def _walk_starts(a, dx, dy, p, s, q, stride, by_x, by_y, height, walk):
     """
@@ -52,7 +34,8 @@ def _walk_starts(a, dx, dy, p, s, q, stride, by_x, by_y, height, walk):
     one, and the factors of the Gaussian in its derivative by x and, short of
     s times the former, by y. Rows from height on stay as they are. Returns
     whether anything is there. The values of the first column are a Gaussian
-    in y, walked outward from its peak. stride is as of `strides`.
+    in y, walked outward from its peak. stride is as of
+    `psf.rows.strides`.
     """
     t, grow, drop, _ = stride
     u = dx

@@ -15,6 +15,7 @@ from tqdm.auto import tqdm
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.base import PSFModel
+from photutils_mgauss.psf.rows import strides
 from photutils_mgauss.utils.parallel import map_parallel
 
 CONVERGED = (kernels.CONVERGED, kernels.STALLED)
@@ -90,9 +91,7 @@ def psf_arrays(model):
     grid = model.grid
     rows, x_grid, y_grid = (_as_kernels_take(a, np.float64)
                             for a in (grid.rows, grid.x_grid, grid.y_grid))
-    strides = np.empty((*rows.shape[:2], 4))
-    kernels.strides(rows, strides)
-    return rows, strides, x_grid, y_grid, model.pixel_integrated
+    return rows, strides(rows), x_grid, y_grid, model.pixel_integrated
 
 
 def is_fixed_shape(model):

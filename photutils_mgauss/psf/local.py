@@ -12,7 +12,7 @@ import numpy as np
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.base import PSFModel
 from photutils_mgauss.psf.grid import match
-from photutils_mgauss.psf.rows import kernel_rows
+from photutils_mgauss.psf.rows import kernel_rows, strides
 
 MAX_WING = 60
 # A cell's families are merged if that changes no pixel by more than this
@@ -157,9 +157,7 @@ class LocalPSF:
     def gaussians_at(self, x, y):
         """Return the PSFs of stars at positions (n,) for the kernels."""
         rows, count = self.rows_at(x, y)
-        strides = np.empty((*rows.shape[:2], 4))
-        kernels.strides(rows, strides)
-        return kernels.Gaussians(rows, strides, count, self.integrated)
+        return kernels.Gaussians(rows, strides(rows), count, self.integrated)
 
     def stamp(self, x, y, half):
         """Draw a star of unit flux in the middle of a stamp."""

@@ -39,6 +39,21 @@ def kernel_rows_of_logs(logs, sign=1.0):
     return rows
 
 
+def strides(rows):
+    """
+    Return the constant factors of walks over Gaussians, (..., K, 4).
+
+    The precision along y at fixed x; how the quotient of columns grows from
+    row to row; how the quotients of rows, and of columns, fall.
+    """
+    p, s, q = (rows[..., i] for i in (3, 4, 5))
+    along_y = q + s * s * p
+    # What overflows belongs to Gaussians that are too thin to be walked over.
+    with np.errstate(over='ignore'):
+        return np.stack([along_y, np.exp(p * s), np.exp(-along_y),
+                         np.exp(-p)], axis=-1)
+
+
 def log_rows(weights, means, covariances):
     """Return the log rows of Gaussians; the signs of weights are lost."""
     narrow, slope, syy = _conditioned(covariances)
