@@ -47,8 +47,10 @@ def examples():
         interpolation='components')
     yield 'photometry', lambda: [
         package.MixturePSFPhotometry(one, (5, 5), aperture_radius=3)(
-            data, error=error, init_params=stars)
+            data, error=error, init_params=stars, mask=error < 0)
         for one in (psf, integrated)]
+    yield 'photometry of several images', lambda: _fit_many(
+        package, psf, data, error)
     yield 'models and errors', lambda: _use_models(package, psf, integrated,
                                                    data, error)
     yield 'mixtures of PSF images', lambda: [
@@ -82,6 +84,19 @@ def _scene(package):
     return psf, data, error, stars
 
 
+def _fit_many(package, psf, data, error):
+    """Fit two stars to an image with a WCS."""
+    from astropy.nddata import NDData, StdDevUncertainty
+    from astropy.wcs import WCS
+
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = 'RA---TAN', 'DEC--TAN'
+    wcs.wcs.cdelt = -1e-5, 1e-5
+    image = NDData(data, uncertainty=StdDevUncertainty(error))
+    package.fit_many([(image, psf, wcs)],
+                     wcs.pixel_to_world([20.3, 40.3], [19.8, 39.8]))
+
+
 def _use_models(package, psf, integrated, data, error):
     """Evaluate all models, and fit with photutils."""
     import numpy as np
@@ -95,6 +110,8 @@ def _use_models(package, psf, integrated, data, error):
         model.fit_deriv(x.ravel(), y.ravel(), 1.0, 4.0, 4.0,
                         *model.parameters[3:])
         package.cramer_rao(model, 1e4, 5.0, x=20.0, y=20.0)
+    free = single.free_shape()
+    free.fit_deriv(x.ravel(), y.ravel(), *free.parameters)
     for grid in (psf, integrated):
         grid.render([3.2], [4.1], 100, 9)
     psf.mixtures[0].gradient(x, y)
@@ -106,7 +123,12 @@ def _use_models(package, psf, integrated, data, error):
 
 
 def _simulate(package, psf, integrated):
-    """Draw stars with every kind of PSF."""
+    """Draw stars with every kind of PSF, and charge that overflows."""
+    import numpy as np
+
+    from photutils_mgauss.simulation.effects import bleed
+
+    bleed(np.array([[9.0], [1.0]]), 5)
     star = [20.3], [30.1], [1e4]
     for one in (psf, integrated, psf.to_gridded_psf(radius=5)):
         package.render_stars(one, *star, (60, 60))

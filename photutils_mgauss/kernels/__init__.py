@@ -56,7 +56,6 @@ __getattr__, __dir__, __all__ = hand_on(__name__, {
     'field_model': 'field_fit',
     'field_normal': 'field_fit',
     'evaluate': 'gaussian',
-    'exponentials': 'gaussian',
     'gradient': 'gaussian',
     'derivatives': 'gaussian',
     'model_rows': 'gaussian',

@@ -52,13 +52,6 @@ def fast_exp(x):
     return 0.0 if x < -688 else series * power
 
 
-@kernel
-def exponentials(x, out):
-    """Put exp(x), x <= 0, into out (n,); for tests."""
-    for i in range(x.size):
-        out[i] = fast_exp(x[i])
-
-
 # One Gaussian at one point. (dx, dy) is the offset from the centre.
 
 @inner

@@ -133,3 +133,16 @@ def test_what_is_compiled_for_python_is_handed_on():
     for name in set(kernels.__all__):
         getattr(kernels, name)
     assert set(jit.KERNELS) <= set(kernels.__all__)
+
+
+def test_the_command_compiles_every_kernel():
+    code = """
+from types import SimpleNamespace
+from photutils_mgauss.cli import compile_command
+from photutils_mgauss.kernels import jit
+compile_command.run(SimpleNamespace(quiet=True))
+print([name for name, kernel in jit.KERNELS.items() if not kernel.signatures])
+"""
+    found = subprocess.run([sys.executable, '-c', code], check=True,
+                           capture_output=True, text=True)
+    assert found.stdout == '[]\n'
