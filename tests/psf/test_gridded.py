@@ -355,8 +355,8 @@ def test_a_large_grid_is_small_in_memory(rng):
 
 def test_the_exponential_function_is_exact_to_the_last_digit(rng):
     x = np.concatenate([-rng.uniform(0, 688, 100_000), [0, -1e-300, -688]])
-    exp = np.vectorize(compiled(fast_exp), otypes=[float])
-    assert_allclose(exp(x), np.exp(x), rtol=3e-16)
+    exp = compiled(fast_exp)
+    assert_allclose([exp(each) for each in x], np.exp(x), rtol=3e-16)
     extremes = np.array([-700, -1e5, -1e300, -np.inf, np.nan])
-    with np.errstate(over='ignore'):
-        assert_array_equal(exp(extremes), [0, 0, 0, 0, np.nan])
+    assert_array_equal([exp(each) for each in extremes],
+                       [0, 0, 0, 0, np.nan])
