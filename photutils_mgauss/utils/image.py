@@ -409,8 +409,9 @@ def photon_slope(data, variance):
     for clipped in (True, False):
         light = np.maximum(data, 0) if clipped else data
         step = np.diff(light)[pairs]
-        power = step @ step
-        slope = step @ change / power if power > 0 else 0.0
+        # Not BLAS: its threads wait for each other on a busy machine.
+        power = np.sum(step**2)
+        slope = np.sum(step * change) / power if power > 0 else 0.0
         if slope <= 0:
             continue
         rest = np.median(np.abs(change - slope * step)) / (slope * noise)
