@@ -310,7 +310,7 @@ def optimise(problem, coefficients, prior, workers, *, max_steps=30,
     """
     present = equations(problem, coefficients, workers)
     cost = _cost(problem, present, prior, coefficients)
-    damping, growth = 1e-3, 2.0
+    damping, growth = 1e-3, kernels.FIRST_GROWTH
     curvature = np.diag(to_vector(prior.precision))
     for _ in range(max_steps):
         problem.sources, problem.sky = present.sources, present.sky
@@ -323,17 +323,12 @@ def optimise(problem, coefficients, prior, workers, *, max_steps=30,
         gain = cost - _cost(problem, new, prior, trial)
         if gain > 0:
             coefficients, present, cost = trial, new, cost - gain
-            # The damping follows how well the gain was foreseen.
-            share = min(gain / expected, 1.0)
-            damping *= max(1 / 5, 1 - (2 * share - 1) ** 3)
-            growth = 2.0
             if max(gain, expected) < tolerance * problem.used.sum():
                 break
         elif damping > 1e6:
             break
-        else:
-            damping *= growth
-            growth *= 2
+        damping, growth = kernels.adapted_damping(damping, growth, gain,
+                                                  expected)
     problem.sources, problem.sky = present.sources, present.sky
     return coefficients, present
 

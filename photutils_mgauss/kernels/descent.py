@@ -1,5 +1,5 @@
 """The damping and the ending of least-squares fits."""
-from photutils_mgauss.kernels.jit import kernel
+from photutils_mgauss.kernels.jit import inner, kernel
 
 # How far a star may move in one step, in pixels.
 LONGEST = 1.0
@@ -7,6 +7,9 @@ LONGEST = 1.0
 # Fits stop when the next step is expected to be below this, in pixels and as
 # a fraction of the flux.
 STEP_TOLERANCE = 1e-6
+
+# By what the damping of `adapted_damping` grows first.
+FIRST_GROWTH = 2.0
 
 # What fraction of the fall of chi2 that the normal equations promise a step
 # should bring: below the first damping grows, above the second it falls.
@@ -48,3 +51,20 @@ def next_damping(damping, gain):
     if gain < _FAIR_GAIN:
         return damping
     return damping / 10 if damping > 1e-4 else 0.0
+
+
+def adapted_damping(damping, growth, fall, expected):
+    """
+    Return damping and its growth after a step, from far off the minimum.
+
+    The damping follows how well the fall of the cost was foreseen, and grows
+    ever faster while steps fail (Nielsen 1999, report IMM-REP-1999-05,
+    Technical University of Denmark).
+    """
+    if not fall > 0:
+        return damping * growth, 2 * growth
+    quality = 2 * fall / max(expected, 1e-300) - 1
+    return damping * max(0.2, 1 - quality ** 3), FIRST_GROWTH
+
+
+compiled_adapted_damping = inner(adapted_damping)

@@ -4,6 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from photutils_mgauss.kernels.descent import (
+    FIRST_GROWTH,
+    compiled_adapted_damping,
+)
 from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import (
     cholesky,
@@ -468,21 +472,21 @@ def _fit_shapes(target, shapes, fluxes, tolerance, max_steps, scratch):
     """
     Fit K Gaussians to a stamp by Levenberg-Marquardt, in place.
 
-    Damping falls with the quality of a step, and grows ever faster while
-    steps fail (Nielsen 1999, IMM-REP-1999-05). Returns cost and status.
+    The damping is that of `adapted_damping`. Returns cost and status.
     """
     cost = _cost(target, shapes, fluxes, scratch)
     _equations(target, shapes, fluxes, scratch)
-    damping, growth, n_small = _FIRST_DAMPING, 2.0, 0
+    damping, growth, n_small = _FIRST_DAMPING, FIRST_GROWTH, 0
     for n_steps in range(1, max_steps + 1):
         gain = _find_step(fluxes, damping, target.fixed_means, scratch)
         _move(shapes, scratch.step, scratch.trial)
         trial_cost = _cost(target, scratch.trial, scratch.trial_fluxes,
                            scratch)
         fall = cost - trial_cost
+        damping, growth = compiled_adapted_damping(damping, growth, fall,
+                                                   gain)
+        damping = max(damping, _LEAST_DAMPING)
         if not fall > 0:
-            damping *= growth
-            growth *= 2
             if damping > _MOST_DAMPING or not gain > _LEAST_GAIN * cost:
                 return cost, FIT_CONVERGED
             continue
@@ -493,9 +497,6 @@ def _fit_shapes(target, shapes, fluxes, tolerance, max_steps, scratch):
             return cost, FIT_CONVERGED
         if n_steps < max_steps:
             _equations(target, shapes, fluxes, scratch)
-        quality = 2 * fall / max(gain, 1e-300) - 1
-        damping = max(damping * max(0.2, 1 - quality ** 3), _LEAST_DAMPING)
-        growth = 2.0
     return cost, FIT_STOPPED
 
 
