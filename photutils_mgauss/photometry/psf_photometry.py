@@ -230,7 +230,7 @@ class MixturePSFPhotometry(PSFPhotometry):
             error = np.sqrt(background
                             + np.maximum(data, 0, dtype=float) / gain)
             gain = None
-        return engine.KernelImage.from_arrays(data, error, mask, gain)
+        return engine.kernel_image(data, error, mask, gain)
 
     def _fit(self, image, init_params):
         """Return the FitResult and the group sizes of all stars."""
@@ -239,9 +239,9 @@ class MixturePSFPhotometry(PSFPhotometry):
         _, inverse, counts = np.unique(groups, return_inverse=True,
                                        return_counts=True)
         rows = np.flatnonzero(start.valid)
-        rows = rows[np.argsort(inverse[rows], kind='stable')]
-        starts = np.unique(np.concatenate([[0], np.flatnonzero(
-            np.diff(inverse[rows])) + 1, [rows.size]]))
+        order, starts = engine.sort_groups(
+            inverse[rows], *start.initial[rows, 1:].T)
+        rows = rows[order]
         stars = start.stars(rows, starts, ~self._free)
         fits = engine.fit_stars(
             image, engine.psf_arrays(self.psf_model), stars,
