@@ -6,7 +6,8 @@ by Levenberg-Marquardt in compiled code; what photutils adds around that
 (tables, units, flags) is not here.
 """
 import itertools
-from contextlib import closing
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -91,6 +92,31 @@ def is_fixed_shape(model):
     """Return whether the kernels can fit all that is free in a model."""
     return (isinstance(model, PSFModel) and model.has_fixed_shape
             and (model.interpolation, model.outside) == ('blend', 'clamp'))
+
+
+# What to use instead of photutils' models.
+_INSTEAD = {
+    'GriddedPSFModel': '`GriddedMixturePSF.from_gridded_psf(psf_model)`',
+    'ImagePSF': '`GriddedMixturePSF.from_image_psf(psf_model)`',
+}
+
+
+def why_not(model):
+    """Return why the kernels cannot fit a model, and what to do about it."""
+    if not isinstance(model, PSFModel):
+        name = type(model).__name__
+        instead = _INSTEAD.get(
+            name, 'a `MultiGaussianPSFModel`, whose mixture `fit_mixture` '
+            'makes of an image of the PSF')
+        return f'psf_model is a {name}', f'use {instead}'
+    if not model.has_fixed_shape:
+        free = [name for name in model.param_names[3:]
+                if not getattr(model, name).fixed]
+        return (f'the shape of psf_model is free ({", ".join(free)})',
+                f'set `psf_model.{free[0]}.fixed = True` and so on')
+    reason = (f'psf_model has interpolation={model.interpolation!r} and '
+              f'outside={model.outside!r}')
+    return reason, "make it with interpolation='blend' and outside='clamp'"
 
 
 def cut_boxes(x, y, fit_shape, data_shape):
@@ -272,7 +298,7 @@ def _fit_chunk(image, psf, fit_sky, max_iterations, stop, stars):
 
 
 def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
-              executor=None, progress_bar=False):
+              executor=None, n_threads=None, progress_bar=False):
     """
     Fit all stars.
 
@@ -287,6 +313,9 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     max_iterations : int, optional
     executor : `~concurrent.futures.Executor`, optional
         Where the chunks are fitted; by default in a pool of threads.
+    n_threads : int, optional
+        How many threads that pool has; by default as many as there are
+        cores.
     progress_bar : bool, optional
         Whether to show how many chunks are done.
 
@@ -300,6 +329,9 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     chunks = list(stars.chunks())
     watch = partial(tqdm, desc='Fitting stars', total=len(chunks),
                     disable=not progress_bar)
-    with closing(map_parallel(work, chunks, executor=executor,
-                              abandon=partial(stop.fill, True))) as fits:
+    pool = (nullcontext(executor) if n_threads is None
+            else ThreadPoolExecutor(n_threads))
+    with pool as executor, closing(map_parallel(
+            work, chunks, executor=executor,
+            abandon=partial(stop.fill, True))) as fits:
         return Fits.joined(list(watch(fits)))
