@@ -48,6 +48,7 @@ _OWNERS = {
     'add_sky_positions': 'photometry',
     'cramer_rao': 'photometry',
     'CramerRao': 'photometry',
+    'decode_psf_flags': 'photometry',
     'fit_many': 'photometry',
     'MixtureFitter': 'photometry',
     'MixturePSFPhotometry': 'photometry',

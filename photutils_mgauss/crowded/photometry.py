@@ -15,7 +15,6 @@ from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.crowded.table import (
     NO_COVARIANCE,
     NO_OVERLAP,
-    REPEATED,
     as_qtable,
     no_stars,
     positions,
@@ -23,7 +22,9 @@ from photutils_mgauss.crowded.table import (
 from photutils_mgauss.crowded.tile import TileOptions
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.psf.renderer import MixtureRenderer
+from photutils_mgauss.utils.flags import REPEATED, decode
 from photutils_mgauss.utils.image import read_pixels, with_unit
+from photutils_mgauss.utils.per_thread import PerThread, keep
 from photutils_mgauss.utils.star_columns import column_values, read_sources
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
@@ -152,7 +153,8 @@ class CrowdedMixturePhotometry:
     Attributes
     ----------
     results : `~astropy.table.QTable`
-        The last table.
+        The last table; where several threads call the object, that of this
+        thread.
 
     Raises
     ------
@@ -192,6 +194,10 @@ class CrowdedMixturePhotometry:
     True
     """
 
+    results = PerThread()
+    # That of a pixel of the last image.
+    _noise = PerThread()
+
     def __init__(self, psf_model, *, threshold=4.5, keep=2.0, depth=3.5,
                  count_slope=1.5, background_size=64, psf_error=0.01,
                  effective_gain=None, maxiters=3, tile_shape=None,
@@ -223,7 +229,6 @@ class CrowdedMixturePhotometry:
         if xy_bounds is not None:
             self.xy_bounds = as_real(xy_bounds, 'xy_bounds', above=0)
         self.results = None
-        # That of a pixel of the last image.
         self._noise = np.inf
         self._psf = LocalPSF.of(psf_model)
 
@@ -264,17 +269,17 @@ class CrowdedMixturePhotometry:
         given = (None if init_params is None
                  else self._listed(init_params, image.unit))
         options = self._options(image)
-        self._noise = options.noise
         plan = Plan(image, self._psf, options, self.tile_shape, self.overlap,
                     given)
         outcomes, errors = run(plan, self.executor, self.progress_bar)
         unfinished = [core for core, outcome in zip(plan.cores, outcomes,
                                                     strict=True)
                       if outcome is None]
-        self.results = self._table(outcomes, given, image.unit)
+        table = self._table(outcomes, given, image.unit)
+        keep(self, results=table, _noise=options.noise)
         if unfinished:
-            raise UnfinishedTilesError(unfinished, self.results) from errors[0]
-        return self.results
+            raise UnfinishedTilesError(unfinished, table) from errors[0]
+        return table
 
     def _listed(self, init_params, unit):
         x, y, flux, number = _given(init_params, unit)
@@ -329,6 +334,32 @@ class CrowdedMixturePhotometry:
                           AstropyUserWarning, stacklevel=4)
         return {'n_stars': len(stars), 'reduced_chi2': chi2,
                 'psf_size_difference': width}
+
+    def decode_flags(self, *, return_bit_values=False):
+        """
+        Put the flags of the last table into words.
+
+        Parameters
+        ----------
+        return_bit_values : bool, optional
+            Whether to return the bits instead of their names.
+
+        Returns
+        -------
+        list of list
+            For each row of the table a list with a name for each bit that is
+            set, as of `decode_psf_flags`.
+
+        Raises
+        ------
+        ValueError
+            If there is no table yet.
+        """
+        if self.results is None:
+            msg = 'decode_flags needs stars: call the object first'
+            raise ValueError(msg)
+        return decode(self.results['flags'],
+                      return_bit_values=return_bit_values)
 
     def make_model_image(self, shape, *, psf_shape=None,
                          include_local_bkg=False):

@@ -5,14 +5,18 @@ from astropy.table import QTable
 from photutils_mgauss import kernels
 from photutils_mgauss.crowded.search import extended
 from photutils_mgauss.crowded.stars import Stars
+from photutils_mgauss.utils.flags import (
+    BLENDED,
+    NOT_A_STAR,
+    NOT_SEEN,
+    REPEATED,
+    SATURATED,
+)
 from photutils_mgauss.utils.star_columns import column_values
 
 # Photutils' own bits.
 PARTIAL, OUTSIDE, NO_FLUX, NO_CONVERGENCE, NO_COVARIANCE = 1, 2, 4, 8, 16
 AT_BOUND, NO_OVERLAP = 32, 64
-# Ours, out of the way of any that photutils may add.
-SATURATED, BLENDED, NOT_A_STAR = 1 << 16, 1 << 17, 1 << 18
-NOT_SEEN, REPEATED = 1 << 19, 1 << 20
 
 # A star that still moved this far in the last step has not converged [pix].
 _STILL = 0.02

@@ -14,7 +14,7 @@ FIRST_GROWTH = 2.0
 # What fraction of the fall of chi2 that the normal equations promise a step
 # should bring: below the first damping grows, above the second it falls.
 POOR_GAIN = 0.25
-_FAIR_GAIN = 0.75
+FAIR_GAIN = 0.75
 
 # The least factor by which steps are taken to get shorter.
 _LEAST_RATE = 0.03
@@ -48,7 +48,7 @@ def next_damping(damping, gain):
     """
     if gain < POOR_GAIN:
         return max(4 * damping, 1e-2)
-    if gain < _FAIR_GAIN:
+    if gain < FAIR_GAIN:
         return damping
     return damping / 10 if damping > 1e-4 else 0.0
 

@@ -69,26 +69,37 @@ def _slice_integral(lower, upper, p):
 
 
 @inner
-def count_panels(p, s, q):
-    """Return how many quadrature panels a pixel needs along y."""
+def pixel_panels(dy, p, s, q):
+    """
+    Return how a pixel at dy is divided along y for quadrature.
+
+    The lower edge of the first panel, the height of all, and their number, 0
+    where nothing is there. Beyond the Gaussian itself there are none, however
+    small it is.
+    """
+    reach = sqrt(LOG_NOTHING / q)
+    low, high = max(dy - 0.5, -reach), min(dy + 0.5, reach)
+    if not low < high:
+        return low, 0.0, 0
     # At fixed x the Gaussian has the precision q + s^2 p along y. Eight
     # points over two standard deviations leave less than 1e-11 of the peak.
-    return max(1, ceil(0.5 * sqrt(q + s * s * p)))
+    n = max(1, ceil(0.5 * (high - low) * sqrt(q + s * s * p)))
+    return low, (high - low) / n, n
 
 
 @inner
 def _pixel_integral(dx, dy, p, s, q):
     """Integrate a Gaussian of unit peak over the unit pixel at (dx, dy)."""
-    n = count_panels(p, s, q)
+    low, height, n = pixel_panels(dy, p, s, q)
     total = 0.0
     for panel in range(n):
-        middle = dy - 0.5 + (panel + 0.5) / n
+        middle = low + (panel + 0.5) * height
         for node in range(NODES.size):
-            t = middle + NODES[node] / n
+            t = middle + NODES[node] * height
             shift = dx - s * t
             total += (NODE_WEIGHTS[node] * exp(-0.5 * q * t * t)
                       * _slice_integral(shift - 0.5, shift + 0.5, p))
-    return total / n
+    return total * height
 
 
 @inner

@@ -57,11 +57,13 @@ def kernel(function=None, *, allocates=False):
     return dispatcher
 
 
-def inner(function=None, *, allocates=False, pipeline=None):
+def inner(function=None, *, allocates=False, pipeline=None, fastmath=False):
     """Compile a function into the kernels that call it."""
     if function is None:
-        return partial(inner, allocates=allocates, pipeline=pipeline)
+        return partial(inner, allocates=allocates, pipeline=pipeline,
+                       fastmath=fastmath)
     return njit(**_OPTIONS, _nrt=allocates, no_cpython_wrapper=True,
+                fastmath=fastmath,
                 pipeline_class=pipeline or _InnerCompiler)(function)
 
 
@@ -73,6 +75,16 @@ def loop(function):
     longer sees that it can work on several pixels at once.
     """
     return inner(function, pipeline=_LoopCompiler)
+
+
+def sums(function):
+    """
+    Compile a loop that adds up numbers, in any order.
+
+    Only then can the compiler work on several of them at once.
+    """
+    return inner(function, pipeline=_LoopCompiler,
+                 fastmath={'reassoc', 'contract', 'nsz'})
 
 
 def folder():

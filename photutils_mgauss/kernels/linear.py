@@ -129,61 +129,6 @@ def solve_non_negative(gram, rhs, signed, x, active, work):
 
 
 @inner
-def _factorize(matrix, frozen, damping, size, steepest, scale, factor):
-    """
-    Put the Cholesky factor of the damped, scaled matrix into factor.
-
-    scale (size,) takes the square roots of the diagonal; rows of frozen
-    parameters become those of the unit matrix. Damping is in units of
-    steepest, the largest diagonal so far: as a star gets faint its position
-    must not become free to run away. Returns whether the matrix is positive
-    definite to working precision.
-    """
-    for a in range(size):
-        d = matrix[a, a]
-        steepest[a] = max(steepest[a], d)
-        if frozen[a] or not d > 0:
-            frozen[a] = True
-            scale[a] = 1.0
-        else:
-            scale[a] = sqrt(d)
-    for a in range(size):
-        for b in range(a + 1):
-            if frozen[a] or frozen[b]:
-                value = 1.0 if a == b else 0.0
-            else:
-                value = matrix[a, b] / (scale[a] * scale[b])
-                if a == b and damping > 0:
-                    value += damping * steepest[a] / matrix[a, a]
-            for c in range(b):
-                value -= factor[a, c] * factor[b, c]
-            if a == b:
-                if not value > 1e-14:
-                    return False
-                factor[a, a] = sqrt(value)
-            else:
-                factor[a, b] = value / factor[b, b]
-    return True
-
-
-@inner
-def _solve(factor, scale, size, vector):
-    """Solve for the scaled vector in place, given the Cholesky factor."""
-    for a in range(size):
-        value = vector[a] / scale[a]
-        for b in range(a):
-            value -= factor[a, b] * vector[b]
-        vector[a] = value / factor[a, a]
-    for a in range(size - 1, -1, -1):
-        value = vector[a]
-        for b in range(a + 1, size):
-            value -= factor[b, a] * vector[b]
-        vector[a] = value / factor[a, a]
-    for a in range(size):
-        vector[a] /= scale[a]
-
-
-@inner
 def eliminate(normal, n, size):
     """Eliminate the first n unknowns from the upper triangle, in place."""
     for k in range(n):

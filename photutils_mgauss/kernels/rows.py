@@ -9,7 +9,7 @@ from photutils_mgauss.kernels.gaussian import (
     NODE_WEIGHTS,
     NODES,
     NOTHING,
-    count_panels,
+    pixel_panels,
 )
 from photutils_mgauss.kernels.jit import inner, kernel
 
@@ -53,12 +53,12 @@ def add_row(peak, u0, p, out):
 @inner
 def add_integrated_row(peak, dx, dy, p, s, q, out):
     """Add the pixel integrals of one row; dx is the offset of its first."""
-    panels = count_panels(p, s, q)
+    low, height, panels = pixel_panels(dy, p, s, q)
     for panel in range(panels):
-        middle = dy - 0.5 + (panel + 0.5) / panels
+        middle = low + (panel + 0.5) * height
         for node in range(NODES.size):
-            t = middle + NODES[node] / panels
-            ridge = (peak * NODE_WEIGHTS[node] / panels
+            t = middle + NODES[node] * height
+            ridge = (peak * NODE_WEIGHTS[node] * height
                      * exp(-0.5 * q * t * t) * HALF_PI_ROOT / sqrt(p))
             if abs(ridge) < NOTHING:
                 continue

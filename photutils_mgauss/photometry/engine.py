@@ -6,7 +6,8 @@ by Levenberg-Marquardt in compiled code; what photutils adds around that
 (tables, units, flags) is not here.
 """
 import itertools
-from contextlib import closing
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -26,37 +27,29 @@ BAD_ERROR = kernels.BAD_ERROR
 _CHUNK = 4000
 
 
-@dataclass(frozen=True, eq=False)
-class KernelImage:
+def kernel_image(data, error=None, mask=None, gain=None):
     """
-    The pixels of an image, as the kernels take them.
+    Return an image as the kernels take it.
 
-    Attributes
+    Parameters
     ----------
     data : (ny, nx) `~numpy.ndarray`
-        The image, float64.
-    error : (ny, nx) or (0, 0) `~numpy.ndarray`
-        The standard deviations; none if empty.
-    mask : (ny, nx) or (0, 0) `~numpy.ndarray`
-        Which pixels are left out; none if empty.
-    gain : float
-        If not 0, the variance of a pixel is the square of its error plus its
+        What is not finite is masked.
+    error, mask : (ny, nx) `~numpy.ndarray`, optional
+    gain : float, optional
+        If given, the variance of a pixel is the square of its error plus its
         stars' light over this.
+
+    Returns
+    -------
+    `~photutils_mgauss.kernels.Image`
     """
-
-    data: np.ndarray
-    error: np.ndarray
-    mask: np.ndarray
-    gain: float = 0.0
-
-    @classmethod
-    def from_arrays(cls, data, error=None, mask=None, gain=None):
-        """Convert to native float64; what is not finite is masked."""
-        data = _as_kernels_take(data, np.float64)
-        mask = _as_kernels_take(_full_mask(data, mask), np.bool_)
-        error = _as_kernels_take(
-            np.empty((0, 0)) if error is None else error, np.float64)
-        return cls(data, error, mask, 0.0 if gain is None else float(gain))
+    data = _as_kernels_take(data, np.float64)
+    mask = _as_kernels_take(_full_mask(data, mask), np.bool_)
+    error = _as_kernels_take(
+        np.empty((0, 0)) if error is None else error, np.float64)
+    return kernels.Image(data, error, mask,
+                         0.0 if gain is None else float(gain))
 
 
 def _as_kernels_take(array, dtype):
@@ -100,6 +93,31 @@ def is_fixed_shape(model):
             and (model.interpolation, model.outside) == ('blend', 'clamp'))
 
 
+# What to use instead of photutils' models.
+_INSTEAD = {
+    'GriddedPSFModel': '`GriddedMixturePSF.from_gridded_psf(psf_model)`',
+    'ImagePSF': '`GriddedMixturePSF.from_image_psf(psf_model)`',
+}
+
+
+def why_not(model):
+    """Return why the kernels cannot fit a model, and what to do about it."""
+    if not isinstance(model, PSFModel):
+        name = type(model).__name__
+        instead = _INSTEAD.get(
+            name, 'a `MultiGaussianPSFModel`, whose mixture `fit_mixture` '
+            'makes of an image of the PSF')
+        return f'psf_model is a {name}', f'use {instead}'
+    if not model.has_fixed_shape:
+        free = [name for name in model.param_names[3:]
+                if not getattr(model, name).fixed]
+        return (f'the shape of psf_model is free ({", ".join(free)})',
+                f'set `psf_model.{free[0]}.fixed = True` and so on')
+    reason = (f'psf_model has interpolation={model.interpolation!r} and '
+              f'outside={model.outside!r}')
+    return reason, "make it with interpolation='blend' and outside='clamp'"
+
+
 def cut_boxes(x, y, fit_shape, data_shape):
     """
     Return the boxes of ``fit_shape`` around stars, trimmed to the image.
@@ -136,6 +154,40 @@ def count_pixels(image, boxes):
     return out
 
 
+def sort_groups(group, x, y):
+    """
+    Put the stars of each group next to each other.
+
+    Within a group they are ordered along its longer side, so that stars that
+    share pixels stand close to each other.
+
+    Parameters
+    ----------
+    group : (n,) `~numpy.ndarray` of int
+        The group of each star.
+    x, y : (n,) `~numpy.ndarray`
+        Finite positions.
+
+    Returns
+    -------
+    order : (n,) `~numpy.ndarray` of int
+    starts : (g + 1,) `~numpy.ndarray` of int
+        Where each group starts in that order.
+    """
+    order = np.argsort(group, kind='stable')
+    starts = np.unique(np.concatenate(
+        [[0], np.flatnonzero(np.diff(group[order])) + 1, [group.size]]))
+    sizes = np.diff(starts)
+    if (sizes == 1).all():
+        return order, starts
+    width, height = (np.maximum.reduceat(axis[order], starts[:-1])
+                     - np.minimum.reduceat(axis[order], starts[:-1])
+                     for axis in (x, y))
+    wide = np.repeat(width >= height, sizes)
+    along = np.where(wide, x[order], y[order])
+    return order[np.lexsort((along, group[order]))], starts
+
+
 @dataclass(frozen=True, eq=False)
 class StarGroups:
     """
@@ -162,6 +214,12 @@ class StarGroups:
     lower: np.ndarray
     upper: np.ndarray
     fixed: np.ndarray
+
+    @property
+    def arrays(self):
+        """The arrays of stars, as the kernel takes them."""
+        return kernels.Stars(self.starts, self.boxes, self.initial, self.sky,
+                             self.lower, self.upper)
 
     def chunks(self):
         """Yield runs of whole groups of about equal cost."""
@@ -218,38 +276,34 @@ class Fits:
 
     @property
     def arrays(self):
-        """All arrays, in the order in which the kernel fills them."""
-        return (self.values, self.sky, self.covariances, self.sums,
-                self.outcome)
+        """All arrays, as the kernel fills them."""
+        return kernels.StarFits(self.values, self.covariances, self.sky,
+                                self.sums, self.outcome)
 
     @classmethod
     def joined(cls, parts):
         """Return the results of all chunks, in order."""
         if not parts:
             return cls.empty(0)
-        values, sky, covariances, sums, outcome = (
-            np.concatenate(arrays) for arrays in zip(
-                *(part.arrays for part in parts), strict=True))
-        return cls(values, covariances, sky, sums, outcome)
+        return cls(*(np.concatenate(arrays) for arrays in zip(
+            *(part.arrays for part in parts), strict=True)))
 
 
-def _fit_chunk(image, psf, fit_sky, max_iterations, stars):
+def _fit_chunk(image, psf, fit_sky, max_iterations, stop, stars):
     fits = Fits.empty(len(stars.initial))
-    kernels.fit_stars(
-        image.data, image.error, image.mask, stars.starts, stars.boxes,
-        stars.initial, stars.sky, stars.lower, stars.upper, stars.fixed,
-        bool(fit_sky), image.gain, psf, max_iterations, *fits.arrays)
+    kernels.fit_stars(image, stars.arrays, stars.fixed, bool(fit_sky), psf,
+                      max_iterations, stop, fits.arrays)
     return fits
 
 
 def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
-              executor=None, progress_bar=False):
+              executor=None, n_threads=None, progress_bar=False):
     """
     Fit all stars.
 
     Parameters
     ----------
-    image : KernelImage
+    image : `~photutils_mgauss.kernels.Image`
     psf : tuple
         See `psf_arrays`.
     stars : StarGroups
@@ -258,6 +312,9 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     max_iterations : int, optional
     executor : `~concurrent.futures.Executor`, optional
         Where the chunks are fitted; by default in a pool of threads.
+    n_threads : int, optional
+        How many threads that pool has; by default as many as there are
+        cores.
     progress_bar : bool, optional
         Whether to show how many chunks are done.
 
@@ -265,9 +322,15 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     -------
     Fits
     """
-    work = partial(_fit_chunk, image, psf, fit_sky, max_iterations)
+    # Where the call is interrupted, a large group would go on for long.
+    stop = np.zeros(1, bool)
+    work = partial(_fit_chunk, image, psf, fit_sky, max_iterations, stop)
     chunks = list(stars.chunks())
     watch = partial(tqdm, desc='Fitting stars', total=len(chunks),
                     disable=not progress_bar)
-    with closing(map_parallel(work, chunks, executor=executor)) as fits:
+    pool = (nullcontext(executor) if n_threads is None
+            else ThreadPoolExecutor(n_threads))
+    with pool as executor, closing(map_parallel(
+            work, chunks, executor=executor,
+            abandon=partial(stop.fill, True))) as fits:
         return Fits.joined(list(watch(fits)))

@@ -18,6 +18,7 @@ from scipy.linalg import cho_solve, cholesky
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.base import PSFModel
 from photutils_mgauss.utils import compat
+from photutils_mgauss.utils.per_thread import PerThread, keep
 from photutils_mgauss.utils.validation import as_integer
 
 __all__ = ['MixtureFitter']
@@ -58,7 +59,8 @@ class MixtureFitter:
     fit_info : dict
         Of the last fit: ``param_cov`` (covariance of the free parameters, or
         None), ``fun`` (weighted model minus data), ``status`` (1 to 4 for
-        success), ``message`` and ``nfev``.
+        success), ``message`` and ``nfev``. Where several threads use the
+        object, each sees what came out of its own last fit.
 
     Examples
     --------
@@ -75,6 +77,7 @@ class MixtureFitter:
     """
 
     supported_constraints = ('fixed', 'bounds')
+    fit_info = PerThread()
 
     def __init__(self):
         self.fit_info = {}
@@ -123,9 +126,9 @@ class MixtureFitter:
     def _fit_with_units(self, model, x, y, z, *, weights, maxiter, inplace):
         problem = _PixelProblem(model, x, y, z, weights)
         state, status, n_steps = _minimize(problem, maxiter)
-        self.fit_info = {
+        keep(self, fit_info={
             'param_cov': problem.covariance(state), 'fun': state.residuals,
-            'status': status, 'message': MESSAGES[status], 'nfev': n_steps}
+            'status': status, 'message': MESSAGES[status], 'nfev': n_steps})
         fitted = model if inplace else model.copy()
         fitted.parameters = problem.full(state.values)
         return fitted

@@ -20,10 +20,10 @@ from astropy.table import QTable
 
 from photutils_mgauss import kernels
 from photutils_mgauss.photometry.engine import (
-    KernelImage,
     as_model,
     cut_boxes,
     is_fixed_shape,
+    kernel_image,
     psf_arrays,
 )
 from photutils_mgauss.sky.tangent_plane import TangentPlane, directions
@@ -256,21 +256,21 @@ class _Images:
         return self.pixels[k] + shift
 
     def _single(self, k, sky, flux):
-        """Return chi2, matrix and gradient of image k alone, and pixels."""
+        """Return the equations of image k alone."""
         n, image = len(sky), self.images[k]
         xy = self._positions(k, sky)
         seen = self.boxes[k][:, 2:].all(axis=1)
         values = np.column_stack([flux, np.where(seen[:, None], xy, 0.0)])
-        chi2, pixels = np.empty(n), np.empty(n, np.int64)
-        matrix, gradient = np.empty((n, 3, 3)), np.empty((n, 3))
-        kernels.star_equations(
-            image.data, image.error, image.mask, self.boxes[k], values,
-            self.psfs[k], chi2, pixels, matrix, gradient)
-        if (pixels < 0).any():
+        single = kernels.SingleEquations(
+            np.empty(n), np.empty((n, 3, 3)), np.empty((n, 3)),
+            np.empty(n, np.int64))
+        kernels.star_equations(image, self.boxes[k], values, self.psfs[k],
+                               single)
+        if (single.n_pixels < 0).any():
             msg = ('images must have positive and finite errors under the '
                    f'stars, got one that is not in image {k}')
             raise ValueError(msg)
-        return chi2, matrix, gradient, pixels
+        return single
 
     def start(self):
         """Return the equations at the linear fluxes at the coordinates."""
@@ -279,9 +279,9 @@ class _Images:
         curve, slope = np.zeros((2, n, self.n_fluxes))
         for k in range(len(self.images)):
             f = k % self.n_fluxes
-            _, matrix, gradient, _ = self._single(k, self.origin, flux[:, f])
-            curve[:, f] += matrix[:, 0, 0]
-            slope[:, f] += gradient[:, 0]
+            single = self._single(k, self.origin, flux[:, f])
+            curve[:, f] += single.matrices[:, 0, 0]
+            slope[:, f] += single.gradients[:, 0]
         flux += slope / np.where(curve > 0, curve, 1)
         return self.evaluate(np.hstack([self.origin, flux]))
 
@@ -293,16 +293,16 @@ class _Images:
         self.n_pixels = np.zeros(n, np.int64)
         for k in range(len(self.images)):
             f = 2 + k % self.n_fluxes
-            one, own, slope, pixels = self._single(k, values[:, :2],
-                                                   values[:, f])
+            single = self._single(k, values[:, :2], values[:, f])
             # From (flux, x, y) of the image to (sky, flux) of the star.
             turn = np.zeros((n, 3, size))
             turn[:, 0, f] = 1
             turn[:, 1:, :2] = self.jacobians[k]
-            matrix += np.einsum('nia,nij,njb->nab', turn, own, turn)
-            gradient += np.einsum('nia,ni->na', turn, slope)
-            chi2 += one
-            self.n_pixels += pixels
+            matrix += np.einsum('nia,nij,njb->nab', turn, single.matrices,
+                                turn)
+            gradient += np.einsum('nia,ni->na', turn, single.gradients)
+            chi2 += single.chi2
+            self.n_pixels += single.n_pixels
         return _Equations(values, chi2, matrix, gradient)
 
     def pixel_length(self, step):
@@ -339,7 +339,7 @@ class _Images:
 
 
 def _read_image(entry):
-    """Return KernelImage, PSF arrays, WCS and unit of one (data, psf, wcs)."""
+    """Return the image, PSF arrays, WCS and unit of one (data, psf, wcs)."""
     if len(entry) != 3:
         msg = f'images must hold (data, psf, wcs), got {len(entry)} things'
         raise ValueError(msg)
@@ -350,7 +350,7 @@ def _read_image(entry):
         msg = f'images must hold PSFs of fixed shape, got {psf!r:.80}'
         raise TypeError(msg)
     pixels = read_pixels(data, name='data of images')
-    image = KernelImage.from_arrays(pixels.data, pixels.error, pixels.mask)
+    image = kernel_image(pixels.data, pixels.error, pixels.mask)
     return image, psf_arrays(psf), wcs, pixels.unit
 
 
@@ -390,7 +390,7 @@ def _minimize(scene, state):
         done |= (length < _TOLERANCE) & (damping < 1)
         gain = _gain(state, trial, step)
         state = state.merge(trial, better & ~done)
-        damping = np.where(better, _next_damping(damping, gain),
+        damping = np.where(better, next_dampings(damping, gain),
                            np.maximum(10 * damping, 1e-3))
         if done.all():
             break
@@ -407,10 +407,11 @@ def _gain(state, trial, step):
                      out=np.full(len(step), kernels.POOR_GAIN))
 
 
-def _next_damping(damping, gain):
-    """Do what the kernel of one fit does, for many stars."""
-    return np.array([kernels.next_damping(*pair)
-                     for pair in zip(damping, gain, strict=True)])
+def next_dampings(damping, gain):
+    """Return what `kernels.next_damping` does, for many fits (n,) at once."""
+    return np.select(
+        [gain < kernels.POOR_GAIN, gain < kernels.FAIR_GAIN, damping > 1e-4],
+        [np.maximum(4 * damping, 1e-2), damping, damping / 10], 0.0)
 
 
 def _steps(state, damping):

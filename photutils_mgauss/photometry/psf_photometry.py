@@ -24,8 +24,9 @@ from photutils_mgauss.photometry import table as _table
 from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
 from photutils_mgauss.utils import compat
 from photutils_mgauss.utils.image import read_pixels, with_unit
+from photutils_mgauss.utils.per_thread import PerThread, keep
 from photutils_mgauss.utils.star_columns import plain_values
-from photutils_mgauss.utils.validation import as_choice, as_real
+from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 
 __all__ = ['MixturePSFPhotometry']
 
@@ -45,14 +46,19 @@ class MixturePSFPhotometry(PSFPhotometry):
         and ``y_0`` fixed the photometry is forced. Any other PSF model, a
         model whose shape is free, and a grid with another ``interpolation``
         than 'blend' or ``outside`` than 'clamp' is handed to
-        `~photutils.psf.PSFPhotometry`.
+        `~photutils.psf.PSFPhotometry`, and a warning says so.
     fit_shape : int or (ny, nx) tuple of int
         The shape of the fitted region, odd.
     fitter : object, optional
         ``None`` or a `MixtureFitter` for the compiled engine. With any other
-        fitter everything is left to `~photutils.psf.PSFPhotometry`.
+        fitter everything is left to `~photutils.psf.PSFPhotometry`, and a
+        warning says so.
     executor : `~concurrent.futures.Executor`, optional
         Where the fits run; by default a pool of threads on all cores.
+    n_threads : int, optional
+        In how many threads the fits run, instead of on all cores; cannot be
+        given beside ``executor``. The compiled engine needs no free-threaded
+        Python for this.
     fit_sky : bool, optional
         Whether to fit a level of the sky for each group, on top of
         ``local_bkg``; adds the columns ``sky`` and ``sky_err``.
@@ -81,10 +87,11 @@ class MixturePSFPhotometry(PSFPhotometry):
     Attributes
     ----------
     results : `~astropy.table.QTable`
-        The table of the last call, with the columns of photutils.
+        The table of the last call, with the columns of photutils. Several
+        threads may call one object; each sees its own last call.
     init_params : `~astropy.table.QTable`
         The initial parameters.
-    fit_info : sequence of dict
+    fit_info : list of dict
         ``param_cov`` (covariance of the free parameters, in the order flux,
         x, y), ``status`` and ``message`` of each star, in the order of
         ``results``; made when asked for.
@@ -111,13 +118,29 @@ class MixturePSFPhotometry(PSFPhotometry):
     [14.2, 15.7, 500.0]
     """
 
+    data_unit = PerThread()
+    finder_results = PerThread()
+    init_params = PerThread()
+    results = PerThread()
+    _fit_info = PerThread()
+
     def __init__(self, psf_model, fit_shape, *, fitter=None, executor=None,
-                 fit_sky=False, effective_gain=None, variance='model',
-                 xy_cov=False, aperture_radius_correction=None, **kwargs):
+                 n_threads=None, fit_sky=False, effective_gain=None,
+                 variance='model', xy_cov=False,
+                 aperture_radius_correction=None, **kwargs):
         fitter = MixtureFitter() if fitter is None else fitter
+        if n_threads is not None and compat.HAS_THREADS:
+            kwargs['n_threads'] = n_threads
         super().__init__(engine.as_model(psf_model), fit_shape, fitter=fitter,
                          **kwargs)
+        self._n_threads = (None if n_threads is None else
+                           as_integer(n_threads, 'n_threads', minimum=1))
+        if n_threads is not None and executor is not None:
+            msg = ('n_threads and executor must not both be given: the '
+                   'executor has its own number of threads')
+            raise ValueError(msg)
         self.executor = executor
+        self._told_of_photutils = False
         self.fit_sky = bool(fit_sky)
         self.effective_gain = (
             None if effective_gain is None
@@ -152,19 +175,30 @@ class MixturePSFPhotometry(PSFPhotometry):
         `~astropy.table.QTable` or None
             The table of results; None if there are no stars.
         """
+        if not self._can_fit and not self._told_of_photutils:
+            self._told_of_photutils = True
+            warnings.warn(self._why_photutils(), AstropyUserWarning,
+                          stacklevel=2)
         if isinstance(data, NDData):
             compat.check_nddata(mask, error)
-        pixels = read_pixels(data, error, mask)
+        call = compat.for_one_call(self)
+        try:
+            return call._measure(read_pixels(data, error, mask), init_params)
+        finally:
+            keep(self, **{name: getattr(call, name)
+                          for name in compat.OF_A_CALL if name != 'fit_info'},
+                 _fit_info=call._fit_info)
+
+    def _measure(self, pixels, init_params):
+        """Do what a call does; changes this object."""
         data, error = (array if array is None
                        else with_unit(array, pixels.unit)
                        for array in (pixels.data, pixels.error))
-        mask = pixels.mask
         if not self._can_fit:
-            return super().__call__(data, mask=mask, error=error,
+            return super().__call__(data, mask=pixels.mask, error=error,
                                     init_params=init_params)
-        compat.reset(self)
         data, mask, error, init_params = compat.prepare_inputs(
-            self, data, mask, error, init_params)
+            self, data, pixels.mask, error, init_params)
         if init_params is None:
             return None
         self._check_inputs(init_params)
@@ -175,6 +209,16 @@ class MixturePSFPhotometry(PSFPhotometry):
                                         error is not None)
         self._warn_of_failures(result)
         return self.results
+
+    @property
+    def fit_info(self):
+        """What is known of each fit, a list of dictionaries."""
+        info = self._fit_info
+        return info.entries if isinstance(info, _table.FitInfo) else info
+
+    @fit_info.setter
+    def fit_info(self, info):
+        self._fit_info = info
 
     @staticmethod
     def fit_many(images, coordinates, **kwargs):
@@ -203,6 +247,16 @@ class MixturePSFPhotometry(PSFPhotometry):
         return (isinstance(self.fitter, MixtureFitter)
                 and engine.is_fixed_shape(self.psf_model))
 
+    def _why_photutils(self):
+        """Return a sentence on why photutils fits, and what to do."""
+        if isinstance(self.fitter, MixtureFitter):
+            reason, remedy = engine.why_not(self.psf_model)
+        else:
+            reason = f'fitter is a {type(self.fitter).__name__}'
+            remedy = 'leave it out'
+        return ('Photutils fits the stars, without compiled code, because '
+                f'{reason}. For fast fits {remedy}.')
+
     @property
     def _free(self):
         """Which of flux, x and y are fitted, (3,)."""
@@ -230,7 +284,7 @@ class MixturePSFPhotometry(PSFPhotometry):
             error = np.sqrt(background
                             + np.maximum(data, 0, dtype=float) / gain)
             gain = None
-        return engine.KernelImage.from_arrays(data, error, mask, gain)
+        return engine.kernel_image(data, error, mask, gain)
 
     def _fit(self, image, init_params):
         """Return the FitResult and the group sizes of all stars."""
@@ -239,13 +293,14 @@ class MixturePSFPhotometry(PSFPhotometry):
         _, inverse, counts = np.unique(groups, return_inverse=True,
                                        return_counts=True)
         rows = np.flatnonzero(start.valid)
-        rows = rows[np.argsort(inverse[rows], kind='stable')]
-        starts = np.unique(np.concatenate([[0], np.flatnonzero(
-            np.diff(inverse[rows])) + 1, [rows.size]]))
+        order, starts = engine.sort_groups(
+            inverse[rows], *start.initial[rows, 1:].T)
+        rows = rows[order]
         stars = start.stars(rows, starts, ~self._free)
         fits = engine.fit_stars(
             image, engine.psf_arrays(self.psf_model), stars,
             fit_sky=self.fit_sky, executor=self.executor,
+            n_threads=self._n_threads,
             max_iterations=as_max_steps(self.fitter_maxiters,
                                         'fitter_maxiters'),
             progress_bar=self.progress_bar)
@@ -282,7 +337,7 @@ class MixturePSFPhotometry(PSFPhotometry):
         if (result.valid & ~result.converged).any():
             msg = ('One or more fit(s) may not have converged. Please check '
                    'the "flags" column in the output table.')
-            warnings.warn(msg, AstropyUserWarning, stacklevel=3)
+            warnings.warn(msg, AstropyUserWarning, stacklevel=4)
 
 
 class _Start:

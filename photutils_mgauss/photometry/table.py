@@ -1,6 +1,6 @@
 """Results, tables and flags of PSF photometry, as photutils makes them."""
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from photutils_mgauss.photometry.engine import CONVERGED
 from photutils_mgauss.photometry.fitter import MESSAGES
 from photutils_mgauss.utils import compat
 
-# Bits of the ``flags`` column, see photutils.psf.decode_psf_flags.
+# Bits of the ``flags`` column, see `decode_psf_flags`.
 PARTIAL = 1
 OUTSIDE_IMAGE = 2
 NON_POSITIVE_FLUX = 4
@@ -84,9 +84,9 @@ class FitResult:
         return np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
 
 
-class FitInfo(Sequence):
+class FitInfo:
     """
-    What photutils keeps of each fit, a dictionary made when asked for.
+    What photutils keeps of each fit, made when it is asked for.
 
     Parameters
     ----------
@@ -103,13 +103,12 @@ class FitInfo(Sequence):
         self._outcome = result.outcome
         self._free = np.flatnonzero(result.free)
 
-    def __len__(self):
-        return len(self._rows)
+    @cached_property
+    def entries(self):
+        """A list with a dictionary for each star."""
+        return [self._entry(row) for row in self._rows]
 
-    def __getitem__(self, index):
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        row = self._rows[index]
+    def _entry(self, row):
         if not self._valid[row]:
             return {}
         status, evaluations = self._outcome[row].tolist()
@@ -119,9 +118,6 @@ class FitInfo(Sequence):
             info['param_cov'] = self._covariances[row][
                 np.ix_(self._free, self._free)]
         return info
-
-    def __repr__(self):
-        return f'<FitInfo of {len(self)} stars>'
 
 
 def define_flags(result, fit_shape, data_shape):

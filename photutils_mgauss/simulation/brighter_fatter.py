@@ -13,25 +13,48 @@ from photutils_mgauss.utils.validation import as_real
 _HALF = 24
 
 
-def shoot_stars(psf, x, y, flux, shape, strength, rng):
+def shoot_stars(psf, x, y, flux, response, strength, rng):
     """
     Return the electrons (ny, nx) of stars whose charge repels.
 
-    Each star's photons are a Poisson number, drawn from its mixture.
+    Each star's photons are a Poisson number, drawn from its mixture; a pixel
+    turns the fraction response (ny, nx) of those that fall on it, relative to
+    a common pixel, into charge.
     """
     sensor = _sensor(psf, strength, rng)
-    ny, nx = shape
-    wide = np.zeros((ny + 2 * _HALF, nx + 2 * _HALF), np.float32)
-    for a, b, number in zip(x, y, rng.poisson(np.maximum(flux, 0)),
-                            strict=True):
-        i, j = round(a), round(b)
-        if not (0 <= i < nx and 0 <= j < ny):
+    response = np.pad(response, _HALF, constant_values=1.0)
+    wide = np.zeros(response.shape, np.float32)
+    stamps = [_stamp(a, b, wide.shape) for a, b in zip(x, y, strict=True)]
+    # So many photons that a pixel of the best response loses none of them.
+    best = np.array([1.0 if stamp is None else response[stamp].max()
+                     for stamp in stamps])
+    numbers = rng.poisson(np.maximum(flux, 0) * best)
+    for a, b, stamp, number in zip(x, y, stamps, numbers, strict=True):
+        if stamp is None:
             continue
-        stamp = wide[j:j + 2 * _HALF + 1, i:i + 2 * _HALF + 1]
-        middle = np.array([[a - i], [b - j]])
+        middle = np.array([[a - round(a)], [b - round(b)]])
         places = middle + photons(psf.mixture_at(a, b), number, rng)
-        stamp[:] = _accumulate(sensor, places, stamp)
+        places = _converted(places, response[stamp], rng)
+        wide[stamp] = _accumulate(sensor, places, wide[stamp])
     return wide[_HALF:-_HALF, _HALF:-_HALF]
+
+
+def _stamp(x, y, shape):
+    """Return the pixels of a star on the wide image; None if it is off it."""
+    i, j = round(x), round(y)
+    if not (0 <= i < shape[1] - 2 * _HALF and 0 <= j < shape[0] - 2 * _HALF):
+        return None
+    return np.s_[j:j + 2 * _HALF + 1, i:i + 2 * _HALF + 1]
+
+
+def _converted(places, response, rng):
+    """Return those photons (2, n) that become charge."""
+    best = response.max()
+    if response.min() == best:
+        return places
+    column, row = np.clip(np.rint(places).astype(int) + _HALF, 0, 2 * _HALF)
+    chance = rng.random(places.shape[1])
+    return places[:, chance * best < response[row, column]]
 
 
 def photons(mixture, number, rng):

@@ -92,6 +92,12 @@ class Chip:
         """The light of the sky in a pixel [electron]."""
         return self.instrument.sky(self.exposure.band)
 
+    @property
+    def response(self):
+        """The response of all pixels (ny, nx)."""
+        return np.concatenate([self.pattern(band).response
+                               for band in self.bands])
+
     def pattern(self, band):
         """Return what is fixed about a band of rows."""
         return pattern(self.effects, self.exposure.detector, band,
@@ -112,8 +118,7 @@ def expose(chip, truth, psf, rng, executor):
     for band, part in zip(chip.bands, parts, strict=True):
         electrons[band], flags[band] = part
     if repel:
-        electrons += shoot_stars(psf, x, y, flux, chip.instrument.shape,
-                                 repel, rng)
+        electrons += shoot_stars(psf, x, y, flux, chip.response, repel, rng)
     add_cosmic_rays(electrons, flags, chip.effects,
                     chip.instrument.exposure_time, rng)
     full_well = chip.instrument.full_well

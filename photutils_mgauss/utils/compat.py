@@ -3,6 +3,7 @@ Everything that depends on the version of photutils.
 
 When photutils >= 3.1 is the oldest supported, this file can go.
 """
+from copy import copy, deepcopy
 from weakref import WeakValueDictionary
 
 import photutils
@@ -80,9 +81,28 @@ def check_nddata(mask, error):
         check(mask=mask, error=error)
 
 
-def reset(photometry):
-    """Forget the results of the last call."""
-    photometry._reset_results()
+# Since 3.1 photutils can fit in several threads.
+HAS_THREADS = minversion(photutils, '3.1')
+
+# What a call leaves in a PSFPhotometry object.
+OF_A_CALL = ('data_unit', 'finder_results', 'init_params', 'results',
+             'fit_info')
+
+
+def for_one_call(photometry):
+    """
+    Return a copy of a PSFPhotometry object that one call may change.
+
+    A call writes its unit and its results into the object and its parts, and
+    photutils 3.0 forgets the grouper when it is given groups. The model, the
+    finder and the grouper are shared.
+    """
+    twin = copy(photometry)
+    twin._data_processor = copy(photometry._data_processor)
+    twin._psf_fitter = copy(photometry._psf_fitter)
+    twin.fitter = twin._psf_fitter.fitter = deepcopy(photometry.fitter)
+    twin._reset_results()
+    return twin
 
 
 def results_table(columns, meta):

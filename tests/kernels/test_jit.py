@@ -123,6 +123,26 @@ def test_only_one_module_names_numba(path):
         name.startswith('numba') for name in modules)
 
 
+@pytest.mark.parametrize('path', SOURCES, ids=lambda path: path.stem)
+def test_no_function_takes_many_arrays(path):
+    """More than eight arrays come as named tuples; numbers do not count."""
+    tree = ast.parse(path.read_text(encoding='utf-8'))
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef) and node.decorator_list:
+            assert len(_arrays(node)) <= 8, node.name
+
+
+def _arrays(function):
+    """Return the arguments that are subscripted or sized."""
+    used = set()
+    for node in ast.walk(function):
+        if (isinstance(node, ast.Subscript | ast.Attribute)
+                and isinstance(node.value, ast.Name)
+                and getattr(node, 'attr', 'size') in ('shape', 'size')):
+            used.add(node.value.id)
+    return used & {argument.arg for argument in function.args.args}
+
+
 def test_no_module_outside_the_room_names_numba():
     assert [path for path in PACKAGE.rglob('*.py')
             if path not in SOURCES

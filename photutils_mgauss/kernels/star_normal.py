@@ -1,0 +1,465 @@
+"""Normal equations of stars: how chi2 changes with flux, x and y of each."""
+from math import log, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from photutils_mgauss.kernels.jit import inner, kernel, sums
+from photutils_mgauss.kernels.tile import LANES, fill_derivatives
+
+# A group of n stars is seen on the pixels of its n boxes, (first row, first
+# column, height, width) each; a single star is a group of one. Where boxes
+# overlap their pixels count once for each box. Parameters are ordered flux, x,
+# y of the first star, of the second, ..., and last, where it is fitted, the
+# sky level common to the group.
+
+# Where the unit-flux image of a star is nowhere above this in a box, the star
+# is left out of its pixels.
+_UNSEEN = 1e-18
+
+# Of the peak: where a star is nowhere above this in the box of another, the
+# box is left out of its rows of the normal matrix, though not of its gradient.
+# The minimum stays where it is, and errors change by the square of this.
+_FAINT = 1e-5
+
+# A Gaussian below this is not drawn in the box of another star: no sum of
+# light has so many digits.
+_DARK = 1e-15
+
+# How far a pixel-integrated Gaussian reaches beyond one that is not [pix].
+_PIXEL = 1.0
+
+
+class Image(NamedTuple):
+    """
+    An image (ny, nx).
+
+    error may be empty, for 1, and mask, for none. If gain is not 0, the
+    variance of a pixel is the square of its error plus its stars' light over
+    this.
+    """
+
+    data: np.ndarray
+    error: np.ndarray
+    mask: np.ndarray
+    gain: float
+
+
+class Pixels(NamedTuple):
+    """The boxes of a group (n, 4), their data and variances (n, area)."""
+
+    boxes: np.ndarray
+    data: np.ndarray
+    variance: np.ndarray
+    gain: float
+
+
+class Equations(NamedTuple):
+    """
+    A group's normal equations, and the weighted residuals they came from.
+
+    weights and residuals are (n, area). Of the matrix the lower triangle is
+    filled; in each row nothing stands before column first (size,).
+    """
+
+    weights: np.ndarray
+    residuals: np.ndarray
+    matrix: np.ndarray
+    gradient: np.ndarray
+    first: np.ndarray
+
+
+class Tiling(NamedTuple):
+    """What `fill_derivatives` works on."""
+
+    walk: np.ndarray
+    tile: np.ndarray
+    index: np.ndarray
+    weights: np.ndarray
+
+
+class Scratch(NamedTuple):
+    """
+    The stars around one box, at most n.
+
+    Their derivatives (n, 3, area), their numbers near (n,), and whether the
+    box is in their rows of the matrix, joined (n,). Stars are looked at
+    within reach of the box [pix], and joined if they are brighter than
+    least. stop (1,) is True once nobody waits for the result.
+    """
+
+    derivatives: np.ndarray
+    near: np.ndarray
+    joined: np.ndarray
+    tiling: Tiling
+    reach: float
+    least: float
+    stop: np.ndarray
+
+
+@kernel
+def count_pixels(mask, boxes, out):
+    """Put the number of pixels of each box that mask leaves into out (n,)."""
+    for i in range(boxes.shape[0]):
+        row, column, height, width = boxes[i]
+        n = 0
+        for y in range(row, row + height):
+            for x in range(column, column + width):
+                n += not mask[y, x]
+        out[i] = n
+
+
+@inner
+def gather(image, box, sky, data, variance):
+    """
+    Copy the pixels of a box less its sky, column after column.
+
+    Masked pixels get an infinite variance. Returns the number of pixels, or
+    -1 if an error is not positive and finite.
+    """
+    row, column, height, width = box
+    n = 0
+    for i in range(width):
+        for j in range(height):
+            k = i * height + j
+            y, x = row + j, column + i
+            if image.mask.size and image.mask[y, x]:
+                data[k] = 0.0
+                variance[k] = np.inf
+                continue
+            data[k] = image.data[y, x] - sky
+            variance[k] = 1.0
+            n += 1
+            if image.error.size:
+                sigma = image.error[y, x]
+                if not 0 < sigma < np.inf:
+                    return -1
+                variance[k] = sigma * sigma
+    return n
+
+
+@inner
+def _weigh(data, variance, sky, gain, old, residual, weight, chi2):
+    """
+    Turn the model of the stars in residual into residuals, and weigh them.
+
+    weight takes the new weights; chi2 (2,) gets the sums of squares with the
+    old weights and with the new ones added. A gain of 0 means that variance
+    does not depend on the model.
+    """
+    with_old = 0.0
+    with_new = 0.0
+    for i in range(data.size):
+        model = residual[i]
+        v = variance[i]
+        if gain > 0 and model > 0:
+            v += model / gain
+        w = 1 / v
+        r = data[i] - sky - model
+        weight[i] = w
+        residual[i] = r
+        with_old += old[i] * r * r
+        with_new += w * r * r
+    chi2[0] += with_old
+    chi2[1] += with_new
+
+
+@sums
+def _add_gradient(derivatives, i, flux, weight, residual, a, gradient):
+    """Add star i's part of the right-hand side in one box, at a."""
+    b0 = 0.0
+    b1 = 0.0
+    b2 = 0.0
+    for k in range(weight.size):
+        wr = weight[k] * residual[k]
+        b0 += wr * derivatives[i, 0, k]
+        b1 += wr * derivatives[i, 1, k]
+        b2 += wr * derivatives[i, 2, k]
+    gradient[a] += b0
+    gradient[a + 1] += flux * b1
+    gradient[a + 2] += flux * b2
+
+
+@sums
+def _add_block(derivatives, i, flux_1, j, flux_2, weight, a, b, matrix):
+    """Add the 3 x 3 block at (a, b) of the matrix, of stars i and j."""
+    a00 = 0.0
+    a01 = 0.0
+    a02 = 0.0
+    a10 = 0.0
+    a11 = 0.0
+    a12 = 0.0
+    a20 = 0.0
+    a21 = 0.0
+    a22 = 0.0
+    for k in range(weight.size):
+        w0 = weight[k] * derivatives[i, 0, k]
+        w1 = weight[k] * derivatives[i, 1, k]
+        w2 = weight[k] * derivatives[i, 2, k]
+        t0 = derivatives[j, 0, k]
+        t1 = derivatives[j, 1, k]
+        t2 = derivatives[j, 2, k]
+        a00 += w0 * t0
+        a01 += w0 * t1
+        a02 += w0 * t2
+        a10 += w1 * t0
+        a11 += w1 * t1
+        a12 += w1 * t2
+        a20 += w2 * t0
+        a21 += w2 * t1
+        a22 += w2 * t2
+    matrix[a, b] += a00
+    matrix[a, b + 1] += flux_2 * a01
+    matrix[a, b + 2] += flux_2 * a02
+    matrix[a + 1, b] += flux_1 * a10
+    matrix[a + 1, b + 1] += flux_1 * flux_2 * a11
+    matrix[a + 1, b + 2] += flux_1 * flux_2 * a12
+    matrix[a + 2, b] += flux_1 * a20
+    matrix[a + 2, b + 1] += flux_1 * flux_2 * a21
+    matrix[a + 2, b + 2] += flux_1 * flux_2 * a22
+
+
+@inner
+def _add_sky(derivatives, i, flux, weight, a, row):
+    """Add what joins star i and the sky level, in one box, at a."""
+    for k in range(weight.size):
+        row[a] += weight[k] * derivatives[i, 0, k]
+        row[a + 1] += weight[k] * derivatives[i, 1, k] * flux
+        row[a + 2] += weight[k] * derivatives[i, 2, k] * flux
+
+
+# How far stars can be seen.
+
+@inner
+def _gaussian_reach(row):
+    """Return how far from the star a Gaussian is above _DARK [pix]."""
+    a, x, y, p, s, q = row
+    if not abs(a) > _DARK:
+        return 0.0
+    # The smaller eigenvalue of the precision matrix.
+    half = 0.5 * (p + q + p * s * s)
+    least = p * q / (half + sqrt(max(half * half - p * q, 0.0)))
+    return sqrt(x * x + y * y) + sqrt(2 * log(abs(a) / _DARK) / least)
+
+
+@inner
+def find_reach(psf):
+    """Return how far stars are seen [pix], and what is too faint to join."""
+    nodes, _, _, _, integrated = psf
+    reach = 0.0
+    peak = 0.0
+    for m in range(nodes.shape[0]):
+        total = 0.0
+        for k in range(nodes.shape[1]):
+            reach = max(reach, _gaussian_reach(nodes[m, k]))
+            total += abs(nodes[m, k, 0])
+        peak = max(peak, total)
+    if integrated:
+        return reach + _PIXEL, _FAINT * min(peak, 1.0)
+    return reach, _FAINT * peak
+
+
+@inner
+def _is_near(x, y, box, reach):
+    """Return whether a star is within reach of the pixels of a box."""
+    row, column, height, width = box
+    dx = max(column - x, x - (column + width - 1), 0.0)
+    dy = max(row - y, y - (row + height - 1), 0.0)
+    return not dx * dx + dy * dy > reach * reach
+
+
+# The equations.
+
+@inner
+def _model_stars(parameters, n, own, box, psf, scratch, residual):
+    """
+    Put the sum of the stars in the box of the star own into residual.
+
+    Lists the stars, ascending, in scratch, and returns their number.
+    """
+    count = 0
+    for i in range(residual.size):
+        residual[i] = 0.0
+    for s in range(n):
+        x, y = parameters[3 * s + 1], parameters[3 * s + 2]
+        if s != own and not _is_near(x, y, box, scratch.reach):
+            continue
+        derivatives = scratch.derivatives[count, :, :residual.size]
+        fill_derivatives(x, y, box, psf, scratch.tiling, derivatives)
+        flux = parameters[3 * s]
+        top = 0.0
+        for i in range(residual.size):
+            residual[i] += flux * derivatives[0, i]
+            top = max(top, abs(derivatives[0, i]))
+        if top > _UNSEEN:
+            scratch.near[count] = s
+            scratch.joined[count] = s == own or top > scratch.least
+            count += 1
+    return count
+
+
+@inner
+def _add_sky_row(parameters, scratch, count, sky, weight, residual, new):
+    """Add what joins the sky level and the stars in one box."""
+    row = new.matrix[sky]
+    for i in range(count):
+        a = 3 * scratch.near[i]
+        _add_sky(scratch.derivatives, i, parameters[a], weight, a, row)
+    for i in range(weight.size):
+        row[sky] += weight[i]
+        new.gradient[sky] += weight[i] * residual[i]
+
+
+@inner
+def _add_equations(parameters, scratch, count, weight, residual, new):
+    """Add what the stars in one box contribute to the normal equations."""
+    lowest = -1
+    for i in range(count):
+        a = 3 * scratch.near[i]
+        flux = parameters[a]
+        _add_gradient(scratch.derivatives, i, flux, weight, residual, a,
+                      new.gradient)
+        if not scratch.joined[i]:
+            continue
+        if lowest < 0:
+            lowest = a
+        for k in range(a, a + 3):
+            new.first[k] = min(new.first[k], lowest)
+        for j in range(i + 1):
+            if scratch.joined[j]:
+                b = 3 * scratch.near[j]
+                _add_block(scratch.derivatives, i, flux, j, parameters[b],
+                           weight, a, b, new.matrix)
+
+
+@inner
+def _clear(equations, n, size):
+    """Empty the equations of n stars."""
+    for a in range(size):
+        equations.gradient[a] = 0.0
+        equations.first[a] = a - a % 3 if a < 3 * n else 0
+        row = equations.matrix[a]
+        # To the end of the block on the diagonal.
+        for b in range(min(a - a % 3 + 3, size)):
+            row[b] = 0.0
+
+
+@inner
+def normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
+                     chi2):
+    """
+    Evaluate a group of n stars.
+
+    old and new are the equations at the last point and at this one; chi2 (2,)
+    gets the sums of squares with the weights of either.
+    """
+    size = 3 * n + fit_sky
+    _clear(new, n, size)
+    chi2[0] = chi2[1] = 0.0
+    sky = parameters[3 * n] if fit_sky else 0.0
+    for c in range(n):
+        if scratch.stop[0]:
+            return
+        used = pixels.boxes[c, 2] * pixels.boxes[c, 3]
+        residual, weight = new.residuals[c, :used], new.weights[c, :used]
+        count = _model_stars(parameters, n, c, pixels.boxes[c], psf, scratch,
+                             residual)
+        _weigh(pixels.data[c, :used], pixels.variance[c, :used], sky,
+               pixels.gain, old.weights[c, :used], residual, weight, chi2)
+        _add_equations(parameters, scratch, count, weight, residual, new)
+        if fit_sky:
+            _add_sky_row(parameters, scratch, count, 3 * n, weight, residual,
+                         new)
+
+
+# Room to work in.
+
+@inner(allocates=True)
+def make_tiling(width):
+    """Return what derivatives in boxes of at most this width need."""
+    return Tiling(np.empty(4 * LANES), np.empty(3 * LANES * width),
+                  np.empty(4, np.int64), np.empty((3, 4)))
+
+
+@inner(allocates=True)
+def make_equations(n, area, size):
+    """Return equations of at most n stars and size parameters."""
+    return Equations(np.zeros((n, area)), np.empty((n, area)),
+                     np.empty((size, size)), np.empty(size),
+                     np.empty(size, np.int64))
+
+
+@inner(allocates=True)
+def make_scratch(n, area, psf, stop):
+    """Return scratch for groups of at most n stars."""
+    # A single star is always looked at.
+    reach, least = find_reach(psf) if n > 1 else (0.0, 0.0)
+    return Scratch(np.empty((n, 3, area)), np.empty(n, np.int64),
+                   np.empty(n, np.bool_), make_tiling(area), reach, least,
+                   stop)
+
+
+@inner
+def largest_area(boxes):
+    """Return the most pixels of a box."""
+    area = 1
+    for s in range(boxes.shape[0]):
+        area = max(area, boxes[s, 2] * boxes[s, 3])
+    return area
+
+
+# Single stars.
+
+@kernel(allocates=True)
+def star_derivatives(x_0, y_0, box, psf, out):
+    """Put the unit-flux PSF in a box, d/dx_0 and d/dy_0 into out (3, n)."""
+    fill_derivatives(x_0, y_0, box, psf, make_tiling(box[3]), out)
+
+
+class SingleEquations(NamedTuple):
+    """
+    Equations of n stars, each by itself.
+
+    chi2 (n,), matrices (n, 3, 3), gradients (n, 3) and the number of pixels
+    (n,), -1 where an error is not positive and finite.
+    """
+
+    chi2: np.ndarray
+    matrices: np.ndarray
+    gradients: np.ndarray
+    n_pixels: np.ndarray
+
+
+@inner
+def _put_star(new, chi2, i, out):
+    """Put the equations of a single star into row i."""
+    out.chi2[i] = chi2
+    for a in range(3):
+        out.gradients[i, a] = new.gradient[a]
+        for b in range(a + 1):
+            out.matrices[i, a, b] = new.matrix[a, b]
+            out.matrices[i, b, a] = new.matrix[a, b]
+
+
+@kernel(allocates=True)
+def star_equations(image, boxes, parameters, psf, out):
+    """
+    Evaluate stars, each by itself; parameters (n, 3) are flux, x and y.
+
+    Those without pixels contribute nothing.
+    """
+    area = largest_area(boxes)
+    data, variance = np.empty((1, area)), np.empty((1, area))
+    new = make_equations(1, area, 3)
+    scratch = make_scratch(1, area, psf, np.zeros(1, np.bool_))
+    chi2 = np.zeros(2)
+    for i in range(boxes.shape[0]):
+        _clear(new, 1, 3)
+        chi2[1] = 0.0
+        n_pixels = gather(image, boxes[i], 0.0, data[0], variance[0])
+        if n_pixels > 0:
+            pixels = Pixels(boxes[i:i + 1], data, variance, 0.0)
+            normal_equations(parameters[i], 1, False, pixels, psf, scratch,
+                             new, new, chi2)
+        out.n_pixels[i] = n_pixels
+        _put_star(new, chi2[1], i, out)
