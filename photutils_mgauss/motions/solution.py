@@ -7,7 +7,7 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from photutils_mgauss.motions.bootstrap import bootstrap_frames
-from photutils_mgauss.motions.corrected_wcs import correct_epochs
+from photutils_mgauss.motions.corrected_epochs import correct_epochs
 from photutils_mgauss.motions.loop import Fit, measured_alone
 from photutils_mgauss.motions.propagation import (
     propagated,

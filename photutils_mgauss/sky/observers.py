@@ -53,6 +53,7 @@ def _plain_years(time, name):
     except (TypeError, ValueError) as error:
         msg = f'{name} must be a Time or Julian years, got {time!r:.80}'
         raise TypeError(msg) from error
+    years = np.where(np.isfinite(years), years, np.nan)
     if (np.abs(years) > MAX_YEAR).any():
         worst = years[np.abs(years) > MAX_YEAR][0] if years.ndim else years
         msg = (f'{name} must be a Time or Julian years below {MAX_YEAR}, got '

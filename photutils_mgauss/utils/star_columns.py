@@ -50,15 +50,8 @@ def read_sources(table, name='stars', *, first='', unit=None):
                f'likes, got {table.colnames}')
         raise ValueError(msg)
     x, y = (column_values(table, f'{axis}{end}', u.pix) for axis in 'xy')
-    return Sources(x, y, _fluxes(table, name, endings, unit),
-                   _selected(table))
-
-
-def _fluxes(table, name, endings, unit):
-    column = find_column(table, [f'flux{e}' for e in endings])
-    if column is None:
-        return np.full(len(table), np.nan)
-    return column_values(table, column, unit)
+    flux = first_values(table, [f'flux{e}' for e in endings], unit)
+    return Sources(x, y, flux, _selected(table))
 
 
 def _selected(table):
@@ -70,6 +63,14 @@ def _selected(table):
 def find_column(table, names):
     """Return the first of some names that a table has, or None."""
     return next((name for name in names if name in table.colnames), None)
+
+
+def first_values(table, names, unit=None):
+    """Return the first of some columns as floats, NaN if there is none."""
+    name = find_column(table, names)
+    if name is None:
+        return np.full(len(table), np.nan)
+    return column_values(table, name, unit)
 
 
 def column_values(table, name, unit=None):
