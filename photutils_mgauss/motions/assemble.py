@@ -1,11 +1,16 @@
 """From epochs and references to arrays: matched, and on one plane."""
 from dataclasses import dataclass
 
+import astropy.units as u
 import numpy as np
 from astropy.table import Table
 from astropy.time import Time
 
-from photutils_mgauss.motions.epoch import check_epochs, read_epochs
+from photutils_mgauss.motions.epoch import (
+    check_epochs,
+    numbers,
+    read_epochs,
+)
 from photutils_mgauss.motions.matching import (
     Matches,
     find_references,
@@ -60,6 +65,8 @@ class Sightings:
         The reference objects that were seen.
     references : (k,) int `~numpy.ndarray`
         The star that each of them is.
+    radial_velocity : (n,) `~numpy.ndarray`
+        Of the stars [km/s], NaN where it is not known.
     notes : tuple of str
         Epochs that have few stars in common with the others, in sentences.
     """
@@ -80,6 +87,7 @@ class Sightings:
     ties: Ties
     catalogue: Catalogue
     references: np.ndarray
+    radial_velocity: np.ndarray
     notes: tuple
 
 
@@ -117,7 +125,20 @@ def assemble(epochs, references, how, transform):
     return Sightings(epochs, plane, unit, every.ids, matches, places,
                      covariance, every.years, years, tdb(years), observer,
                      every.usable, every.flux, ties, catalogue, stars,
+                     _radial_velocities(epochs, matches, catalogue, stars),
                      _few_in_common(matches.seen))
+
+
+def _radial_velocities(epochs, matches, catalogue, stars):
+    """Return those of all stars (n,), the catalogue's before others."""
+    out = np.full(matches.rows.shape[1], np.nan)
+    out[stars] = catalogue.radial_velocity
+    for epoch, rows in zip(epochs, matches.rows, strict=True):
+        if 'radial_velocity' in epoch.table.colnames:
+            empty = np.isnan(out) & (rows >= 0)
+            out[empty] = numbers(epoch.table, 'radial_velocity',
+                                 u.km / u.s)[rows[empty]]
+    return out
 
 
 def _few_in_common(seen):

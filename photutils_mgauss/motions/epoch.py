@@ -268,12 +268,18 @@ def sky_vectors(epoch):
         x, y = pixels(epoch)
         vectors = pixel_to_vectors(epoch.wcs, x, y)
     else:
-        vectors = unit_vectors(numbers(epoch.table, 'ra', u.deg),
-                               numbers(epoch.table, 'dec', u.deg))
+        vectors = table_vectors(epoch.table)
     velocity = observer_velocity(epoch.observer)
     if velocity is None:
         return vectors
     return remove_aberration(vectors, velocity)
+
+
+def table_vectors(table):
+    """Return ICRS unit vectors (3, n) of ra and dec, NaN for no places."""
+    dec = numbers(table, 'dec', u.deg)
+    return unit_vectors(numbers(table, 'ra', u.deg),
+                        np.where(np.abs(dec) <= 90, dec, np.nan))
 
 
 def pixels(epoch):

@@ -12,6 +12,7 @@ from photutils_mgauss.motions.joint import (
     solve_all,
     total_chi2,
 )
+from photutils_mgauss.motions.perspective import drift, refined
 from photutils_mgauss.motions.prepare import Setup, State
 from photutils_mgauss.motions.problem import MotionProblem
 from photutils_mgauss.motions.relative import remove_mean_fields
@@ -77,8 +78,10 @@ def pose(setup, state):
         covariance = measured(setup, state, e)
         weights[:, e] = np.where(state.used[e], invert_2x2(*covariance), 0.0)
     if setup.drift is not None:
-        stars, drift = setup.drift
-        offsets[..., stars] -= drift
+        stars, parallactic = setup.drift
+        offsets[..., stars] -= parallactic
+    if len(setup.nearing.stars):
+        offsets[..., setup.nearing.stars] -= drift(setup, state.space)
     np.nan_to_num(offsets, copy=False)
     return MotionProblem(
         offsets, weights, setup.origin, setup.dt,
@@ -110,17 +113,23 @@ def _step(setup, state):
     frames = solve_frames(problem, reduced, relative=setup.relative)
     maps = np.stack([setup.transform.project(one)
                      for one in state.maps + frames.correction])
-    return problem, frames, replace(state, maps=maps)
+    space = state.space
+    if len(setup.nearing.stars):
+        space = refined(setup, space, solve(
+            setup, problem.select(setup.nearing.stars), frames).values)
+    return problem, frames, replace(state, maps=maps, space=space)
 
 
 def _align(setup, state):
     """Iterate until the maps stand still."""
     before, typical = np.inf, np.sqrt(setup.typical_variance)
     for i in range(MAX_ITERATIONS):
-        problem, frames, state = _step(setup, state)
+        problem, frames, after = _step(setup, state)
         # In units of a typical error.
         size = np.abs(frames.correction).sum(axis=2).max(initial=0) / typical
-        if size < CONVERGED:
+        swerve = _swerve(setup, state.space, after.space) / typical
+        state = after
+        if size < CONVERGED and swerve < CONVERGED:
             break
         if i > 5 and not size < before:
             msg = ('epochs must agree on which star is which, got frames '
@@ -129,6 +138,13 @@ def _align(setup, state):
             raise ValueError(msg)
         before = size
     return problem, frames, state
+
+
+def _swerve(setup, before, after):
+    """Return how far the stars of known radial velocity were moved."""
+    if not len(setup.nearing.stars):
+        return 0.0
+    return np.abs(drift(setup, after) - drift(setup, before)).max()
 
 
 def fit(setup, state):
@@ -150,9 +166,9 @@ def fit(setup, state):
             break
     estimates = solve(setup, problem, frames, residuals=True)
     if setup.relative and setup.transform.kind != 'none':
-        estimates, drift = remove_mean_fields(problem, frames, estimates,
-                                              setup.options)
-        state = replace(state, maps=state.maps - drift)
+        estimates, common = remove_mean_fields(problem, frames, estimates,
+                                               setup.options)
+        state = replace(state, maps=state.maps - common)
     return finished(setup, state, problem, frames, estimates)
 
 

@@ -5,12 +5,17 @@ import astropy.units as u
 import numpy as np
 
 from photutils_mgauss.motions.assemble import Sightings
+from photutils_mgauss.motions.perspective import (
+    Nearing,
+    first_values,
+    nearing_stars,
+)
 from photutils_mgauss.motions.priors import (
     Priors,
     add_parallax_prior,
     build_priors,
 )
-from photutils_mgauss.motions.references import perspective
+from photutils_mgauss.motions.references import carried
 from photutils_mgauss.sky.transforms import Transform
 
 
@@ -68,7 +73,12 @@ class Setup:
     relative : bool
         Whether there are no references, and all stars are anchors.
     drift : (stars, displacements) or None
-        Known displacements (2, E, k) of k references beyond the model.
+        Displacements (2, E, k) of k references by parallaxes that are known
+        and not fitted.
+    nearing : `~photutils_mgauss.motions.perspective.Nearing`
+        Stars of known radial velocity.
+    notes : tuple of str
+        What could not be used, in sentences.
     typical_variance : float
         Median variance of the detections, 1 if there are none.
     """
@@ -84,6 +94,8 @@ class Setup:
     held: np.ndarray
     relative: bool
     drift: tuple | None
+    nearing: Nearing
+    notes: tuple
     typical_variance: float
 
 
@@ -94,7 +106,9 @@ class State:
 
     ``maps`` (E, 2, b), ``used`` (E, n), ``floor`` (E,) variances per axis,
     ``dropped`` (k,) stars that are references no longer, ``untied`` (n,)
-    stars whose detections disagree too much to find the frames with.
+    stars whose detections disagree too much to find the frames with,
+    ``space`` (5, k) positions, motions and parallaxes of the stars of known
+    radial velocity, at the working epoch.
     """
 
     maps: np.ndarray
@@ -102,6 +116,7 @@ class State:
     floor: np.ndarray
     dropped: np.ndarray
     untied: np.ndarray
+    space: np.ndarray
 
 
 def prepare(sightings, options):
@@ -120,10 +135,14 @@ def prepare(sightings, options):
     dt = np.nan_to_num(sightings.years - working)
     untied = _scattered(sightings, anchors, options.max_motion)
     _check_references(sightings, anchors, untied, relative, options.transform)
-    origin, transform = _field(sightings, options.transform)
-    drift = _drift(sightings, origin, dt, options)
+    origin, transform = _field(sightings, options.transform, ~untied)
+    drift = _drift(sightings, origin, options)
+    nearing, notes = nearing_stars(sightings, options)
     use = ~np.isin(stars, held)
-    priors = build_priors(catalogue.select(use), stars[use],
+    known = catalogue
+    if len(nearing.stars):
+        known = carried(catalogue, working)
+    priors = build_priors(known.select(use), stars[use],
                           origin[:, stars[use]], working, sightings.unit,
                           options.n_star_parameters)
     if options.parallax == 'prior':
@@ -132,10 +151,11 @@ def prepare(sightings, options):
     variance = sightings.covariance[0][sightings.usable]
     maps = np.repeat(transform.identity()[None], len(dt), axis=0)
     return (Setup(sightings, options, transform, origin, working, dt, priors,
-                  anchors, held, relative, drift,
+                  anchors, held, relative, drift, nearing, notes,
                   np.median(variance) if variance.size else 1.0),
             State(maps, sightings.usable.copy(), floor,
-                  np.empty(0, dtype=int), untied))
+                  np.empty(0, dtype=int), untied,
+                  first_values(nearing, sightings, origin, working)))
 
 
 def _check_parallax(options, sightings):
@@ -209,31 +229,30 @@ def _check_references(sightings, anchors, untied, relative, transform):
         raise ValueError(msg)
 
 
-def _field(sightings, transform):
-    """Return the stars' mean places, and the maps' coordinates for them."""
+def _field(sightings, transform, sound):
+    """
+    Return the stars' mean places, and the maps' coordinates for them.
+
+    The coordinates suit the stars whose places are ``sound`` (n,), if any.
+    """
     count = np.isfinite(sightings.places[0]).sum(axis=0)
     with np.errstate(invalid='ignore'):
         origin = (np.nansum(sightings.places, axis=1)
                   / np.where(count, count, np.nan))
-    transform = transform.fitted_to(origin)
+    transform = transform.fitted_to(origin[:, sound] if sound.any()
+                                    else origin)
     return np.where(np.isfinite(origin), origin,
                     np.reshape(transform.centre, (2, 1))), transform
 
 
-def _drift(sightings, origin, dt, options):
-    """
-    Return references and their displacements beyond the model, or None.
-
-    Known parallaxes where none are fitted, and perspective acceleration.
-    """
+def _drift(sightings, origin, options):
+    """Return references and their displacements by known parallaxes."""
     stars, catalogue = sightings.references, sightings.catalogue
-    years = dt if dt.shape[1] == 1 else dt[:, stars]
-    out = perspective(catalogue)[:, None, :] * years**2 / 2
-    if sightings.plane is not None and not options.parallax:
-        observer = sightings.observer
-        if observer.shape[2] > 1:
-            observer = observer[..., stars]
-        parallax = np.nan_to_num(catalogue.values[4])
-        out = out + parallax * sightings.plane.parallax_factors(
-            origin[:, None, stars], observer)
-    return (stars, out) if np.any(out) else None
+    parallax = np.nan_to_num(catalogue.values[4])
+    if sightings.plane is None or options.parallax or not parallax.any():
+        return None
+    observer = sightings.observer
+    if observer.shape[2] > 1:
+        observer = observer[..., stars]
+    return stars, parallax * sightings.plane.parallax_factors(
+        origin[:, None, stars], observer)

@@ -3,6 +3,7 @@ import numpy as np
 
 from photutils_mgauss.motions.joint import cross_covariance
 from photutils_mgauss.motions.problem import CHUNK
+from photutils_mgauss.sky.space_motion import beyond_straight, jacobian
 from photutils_mgauss.sky.tangent_plane import directions
 
 FROM_OURS = [0, 1, 4, 2, 3]  # to Gaia's order: position, parallax, motion
@@ -33,14 +34,24 @@ def at_epoch(fit, year, stars):
 
     Positions are plane coordinates, no longer relative to an origin.
     """
-    move = _shift_in_time(fit, year)
-    values = move @ fit.estimates.values[:, stars]
-    values[:2] += fit.setup.origin[:, stars]
-    half = np.tensordot(move, fit.estimates.covariance[..., stars], axes=1)
-    return values, np.einsum('ijn,kj->ikn', half, move)
+    values = fit.estimates.values[:, stars]
+    covariance = fit.estimates.covariance[..., stars]
+    move = _straight(fit, year)
+    moved = move @ values
+    half = np.tensordot(move, covariance, axes=1)
+    spread = np.einsum('ijn,kj->ikn', half, move)
+    numbers = np.arange(fit.problem.n_stars)[stars]
+    near = np.flatnonzero(np.isin(numbers, fit.setup.nearing.stars))
+    if near.size:
+        swerve, change = _in_space(fit, year, numbers[near])
+        moved[:len(swerve), near] += swerve
+        half = np.einsum('ijn,jkn->ikn', change, covariance[..., near])
+        spread[..., near] = np.einsum('ijn,kjn->ikn', half, change)
+    moved[:2] += fit.setup.origin[:, stars]
+    return moved, spread
 
 
-def _shift_in_time(fit, year):
+def _straight(fit, year):
     """Return the matrix from parameters at the working epoch to a year."""
     dt = year - fit.setup.working_year
     move = np.eye(fit.problem.n_parameters)
@@ -49,6 +60,26 @@ def _shift_in_time(fit, year):
         move[0, -2] = move[1, -1] = dt**2 / 2
         move[2, -2] = move[3, -1] = dt
     return move
+
+
+def _in_space(fit, year, stars):
+    """
+    Return how stars of known radial velocity leave a straight motion.
+
+    What is to be added to their first 4 or 5 parameters (size, k), and the
+    matrices (p, p, k) that stand in the place of `_straight`.
+    """
+    setup, nearing = fit.setup, fit.setup.nearing
+    size = 5 if setup.options.parallax else 4
+    which = np.searchsorted(nearing.stars, stars)
+    velocity, dt = nearing.velocity[which], year - setup.working_year
+    values = np.empty((5, len(stars)))
+    values[4] = nearing.parallax[which]
+    values[:size] = fit.estimates.values[:size, stars]
+    values[:2] += setup.origin[:, stars]
+    change = np.repeat(_straight(fit, year)[..., None], len(stars), axis=2)
+    change[:size, :size] = jacobian(values, velocity, dt)[:size, :size]
+    return beyond_straight(values, velocity, dt)[:size], change
 
 
 def turned(plane, values, covariance):
@@ -80,7 +111,11 @@ def star_covariance(fit, stars, ref_year):
     problem = fit.problem.select(stars)
     covariance = cross_covariance(problem, fit.frames.factor)
     size = problem.n_parameters
-    change = np.repeat(_shift_in_time(fit, ref_year)[None], len(stars), 0)
+    change = np.repeat(_straight(fit, ref_year)[None], len(stars), 0)
+    near = np.flatnonzero(np.isin(stars, fit.setup.nearing.stars))
+    if near.size:
+        change[near] = _in_space(fit, ref_year, stars[near])[1].transpose(
+            2, 0, 1)
     plane = fit.setup.sightings.plane
     if plane is not None:
         places = at_epoch(fit, ref_year, stars)[0][:2]

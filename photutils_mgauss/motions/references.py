@@ -10,10 +10,14 @@ from dataclasses import dataclass, replace
 import astropy.units as u
 import numpy as np
 
-from photutils_mgauss.motions.epoch import names_of, numbers
+from photutils_mgauss.motions.epoch import (
+    names_of,
+    numbers,
+    table_vectors,
+)
 from photutils_mgauss.motions.stacked import apply
 from photutils_mgauss.sky.observers import julian_years
-from photutils_mgauss.sky.tangent_plane import unit_vectors
+from photutils_mgauss.sky.space_motion import jacobian, moved
 from photutils_mgauss.utils.star_columns import find_column
 
 CLASSES = ('qso', 'galaxy', 'star', 'position')
@@ -21,9 +25,6 @@ FIXED = ('qso', 'galaxy')  # neither move nor have a parallax
 GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
 UNKNOWN = 1e30  # variance of what is not known
 ORDER = [0, 1, 3, 4, 2]  # Gaia's order to ours: position, motion, parallax
-# mas/yr^2 of perspective acceleration for unit motion [mas/yr], parallax
-# [mas] and radial velocity [km/s]: -2 / (4.74047 km/s * 206264806 mas).
-PERSPECTIVE = -2 / (4.740470446 * 206264806.24709636)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +88,10 @@ def read_catalogue(table, plane, unit):
     values[:2] = _positions(table, plane, unit)
     if plane is not None and np.isfinite(values[:2]).any():
         turn = np.zeros((5, 5, n))
-        jacobian = plane.local_jacobian(values[:2])
+        local = plane.local_jacobian(values[:2])
         # A star of unknown place keeps its motion.
         turn[:2, :2] = turn[2:4, 2:4] = np.where(
-            np.isfinite(jacobian), jacobian, np.eye(2)[..., None])
+            np.isfinite(local), local, np.eye(2)[..., None])
         turn[4, 4] = 1
         values[2:4] = apply(turn[2:4, 2:4], values[2:4])
         covariance = np.einsum('ijn,jkn,lkn->iln', turn, covariance, turn)
@@ -117,8 +118,7 @@ def _kinds(table):
 
 def _positions(table, plane, unit):
     if plane is not None:
-        return plane.project(unit_vectors(numbers(table, 'ra', u.deg),
-                                          numbers(table, 'dec', u.deg)))
+        return plane.project(table_vectors(table))
     return np.stack([numbers(table, key, _unit(unit)) for key in 'xy'])
 
 
@@ -173,8 +173,27 @@ def _check_motions(kinds, values):
         raise ValueError(msg)
 
 
-def perspective(catalogue):
-    """Return known perspective accelerations (2, k) [unit/yr^2], 0 else."""
-    rate = (PERSPECTIVE * catalogue.values[4] * catalogue.radial_velocity
-            * catalogue.values[2:4])
-    return np.nan_to_num(rate)
+def carried(catalogue, year):
+    """
+    Return the catalogue with all motions in space carried to a year.
+
+    Only stars of known motion, parallax and radial velocity [mas, km/s] do
+    not move along straight lines; all others stay as they are.
+    """
+    space = (np.isfinite(catalogue.values).all(axis=0)
+             & np.isfinite(catalogue.radial_velocity + catalogue.year))
+    if not space.any():
+        return catalogue
+    old, velocity = (catalogue.values[:, space],
+                     catalogue.radial_velocity[space])
+    dt = year - catalogue.year[space]
+    turn = jacobian(old, velocity, dt)
+    covariance = catalogue.covariance.copy()
+    # A parallax without an error is taken as it is.
+    turn[:4, 4] *= covariance[4, 4, space] < 1e-3 * UNKNOWN
+    values, years = catalogue.values.copy(), catalogue.year.copy()
+    values[:, space], years[space] = moved(old, velocity, dt), year
+    covariance[..., space] = np.einsum(
+        'ijn,jkn,lkn->iln', turn, covariance[..., space], turn)
+    return replace(catalogue, values=values, covariance=covariance,
+                   year=years)

@@ -60,7 +60,8 @@ def solution_of(result, ref_epoch=None):
     return MotionSolution(
         star_table(result, year, parameters), corrected,
         alignment_table(result, residuals),
-        result.frames.undetermined + result.setup.sightings.notes, result)
+        (*result.frames.undetermined, *result.setup.notes,
+         *result.setup.sightings.notes), result)
 
 
 @dataclass(frozen=True, eq=False)

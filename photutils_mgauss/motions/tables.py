@@ -6,6 +6,7 @@ from astropy.table import QTable
 from photutils_mgauss.motions.joint import solve_all
 from photutils_mgauss.motions.loop import measured
 from photutils_mgauss.motions.propagation import FROM_OURS
+from photutils_mgauss.motions.references import carried
 from photutils_mgauss.motions.stacked import invert_2x2
 from photutils_mgauss.sky.tangent_plane import directions
 
@@ -57,7 +58,8 @@ def validation_table(fit, stars):
     """Return held-out references beside their catalogue values."""
     sightings, held = fit.setup.sightings, fit.setup.held
     unit = u.Unit(sightings.unit) / u.yr
-    motion, covariance = _catalogue_motions(sightings, held)
+    year = float(stars['ref_epoch'][0].value)
+    motion, covariance = _catalogue_motions(sightings, held, year)
     rows = stars[held]
     table = QTable({'id': rows['id']})
     away, errors = [], []
@@ -76,10 +78,12 @@ def validation_table(fit, stars):
     return table
 
 
-def _catalogue_motions(sightings, stars):
+def _catalogue_motions(sightings, stars, year):
     """Return catalogue motions (2, k) and covariances in local axes."""
     place = {star: k for k, star in enumerate(sightings.references)}
     catalogue = sightings.catalogue.select([place[star] for star in stars])
+    if sightings.unit == 'mas':
+        catalogue = carried(catalogue, year)
     motion = catalogue.motion()
     covariance = catalogue.covariance[2:4, 2:4] * ~catalogue.fixed
     if sightings.plane is not None:
@@ -106,6 +110,8 @@ def star_table(fit, ref_year, parameters):
     if fit.leak is not None:
         flags |= _add_leak(table, fit.leak, solved)
     table['flux'] = _mean_flux(sightings.flux)
+    if np.isfinite(sightings.radial_velocity).any():
+        table['radial_velocity'] = sightings.radial_velocity * u.km / u.s
     table['reference'] = _reference_kinds(fit)
     table['flags'] = flags
     table.meta['TIMESYS'] = 'TDB'
