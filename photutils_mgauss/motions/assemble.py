@@ -1,16 +1,11 @@
 """From epochs and references to arrays: matched, and on one plane."""
 from dataclasses import dataclass
 
-import astropy.units as u
 import numpy as np
 from astropy.table import Table
 from astropy.time import Time
 
-from photutils_mgauss.motions.epoch import (
-    check_epochs,
-    numbers,
-    read_epochs,
-)
+from photutils_mgauss.motions.epoch import check_epochs, read_epochs
 from photutils_mgauss.motions.matching import (
     Matches,
     find_references,
@@ -58,11 +53,13 @@ class Sightings:
         Barycentric places of the observers [au], None without a plane.
     usable : (E, n) bool `~numpy.ndarray`
         Detections with finite positions and good errors.
-    flux : (E, n) `~numpy.ndarray`
+    flux : (n,) `~numpy.ndarray`
+        Mean flux of each star.
     ties : `~photutils_mgauss.motions.ties.Ties`
         What took the planes without WCS to the common one.
     catalogue : `Catalogue`
-        The reference objects that were seen.
+        The reference objects that were seen; motions in space are those of
+        the mean time of the epochs.
     references : (k,) int `~numpy.ndarray`
         The star that each of them is.
     radial_velocity : (n,) `~numpy.ndarray`
@@ -120,25 +117,17 @@ def assemble(epochs, references, how, transform):
                  else catalogue.select(seen))
     places, covariance, ties = tie_planes(every, years, catalogue, stars,
                                           on_sky, transform)
+    if unit == 'mas':
+        catalogue = catalogue.at(float(np.nanmean(years)))
+    velocity = every.radial_velocity.copy()
+    velocity[stars] = np.where(np.isfinite(catalogue.radial_velocity),
+                               catalogue.radial_velocity, velocity[stars])
     observer = None if plane is None else observer_positions(
         [epoch.observer for epoch in epochs], every.years)
     return Sightings(epochs, plane, unit, every.ids, matches, places,
                      covariance, every.years, years, tdb(years), observer,
                      every.usable, every.flux, ties, catalogue, stars,
-                     _radial_velocities(epochs, matches, catalogue, stars),
-                     _few_in_common(matches.seen))
-
-
-def _radial_velocities(epochs, matches, catalogue, stars):
-    """Return those of all stars (n,), the catalogue's before others."""
-    out = np.full(matches.rows.shape[1], np.nan)
-    out[stars] = catalogue.radial_velocity
-    for epoch, rows in zip(epochs, matches.rows, strict=True):
-        if 'radial_velocity' in epoch.table.colnames:
-            empty = np.isnan(out) & (rows >= 0)
-            out[empty] = numbers(epoch.table, 'radial_velocity',
-                                 u.km / u.s)[rows[empty]]
-    return out
+                     velocity, _few_in_common(matches.seen))
 
 
 def _few_in_common(seen):

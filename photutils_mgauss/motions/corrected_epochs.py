@@ -43,10 +43,10 @@ def correct_epoch(epoch, correction, tie, rows):
         return epoch, np.nan
     pixel_map = None
     if epoch.wcs is None:
-        pixel_map = np.column_stack([tie[:, 0], tie[:, 1:] * epoch.pixel_size])
-    wcs, residual = corrected_wcs(
-        epoch.wcs, correction, Region.of(epoch.wcs, *_stars_pixels(epoch, rows)),
-        pixel_map)
+        pixel_map = np.column_stack([tie[:, 0],
+                                     tie[:, 1:] * epoch.pixel_size])
+    region = Region.of(epoch.wcs, *_stars_pixels(epoch, rows))
+    wcs, residual = corrected_wcs(epoch.wcs, correction, region, pixel_map)
     return replace(epoch, wcs=wcs, pixel_scale=None), residual
 
 

@@ -57,10 +57,11 @@ class Epoch:
           [mas], the first with the cosine of the declination in it, as in
           the Gaia catalogue (``ra_err`` and ``dec_err`` will do).
 
-        Optional columns: ``id`` (any type, unique), ``flux_fit``, and
-        ``time``, the time of each row. Columns may have other units.
-        Masked and non-finite positions are left out and flagged; errors
-        that are not positive get no weight and a flag.
+        Optional columns: ``id`` (any type, unique), ``flux_fit``,
+        ``radial_velocity`` [km/s], and ``time``, the time of each row.
+        Columns may have other units. Masked and non-finite positions are
+        left out and flagged; errors that are not positive get no weight
+        and a flag.
     wcs : APE 14 WCS, optional
         A gwcs or `astropy.wcs.WCS` with celestial axes, of which only the
         forward transform is used. Without one, pixels are coordinates in a
@@ -236,7 +237,8 @@ class Detections:
     What an epoch says about each of its n rows, as plain arrays.
 
     For n stars at E epochs the arrays have an axis of epochs before the
-    last, and ``ids`` (n,) are the names of the stars.
+    last, but ``ids`` (n,) are the names of the stars, and ``flux`` and
+    ``radial_velocity`` (n,) [km/s] their means.
 
     ``plane`` (2, n) and ``covariance`` (3, n: xx, xy, yy) are in the frame's
     unit, mas or pixels. ``found`` says which positions are finite,
@@ -248,6 +250,7 @@ class Detections:
     covariance: np.ndarray
     years: np.ndarray
     flux: np.ndarray
+    radial_velocity: np.ndarray
     found: np.ndarray
     usable: np.ndarray
 
@@ -371,6 +374,7 @@ def read_epoch(epoch, plane=None, vectors=None):
     """
     years = np.asarray(epoch.years, dtype=float)
     ids, flux = _ids(epoch.table), numbers(epoch.table, 'flux')
+    velocity = numbers(epoch.table, 'radial_velocity', u.km / u.s)
     if vectors is None:
         positions, covariance = _read_plane(epoch)
     else:
@@ -378,7 +382,7 @@ def read_epoch(epoch, plane=None, vectors=None):
         covariance = _sky_covariance(epoch, plane, positions)
     found = np.isfinite(positions).all(axis=0) & np.isfinite(years)
     return Detections(ids, np.where(found, positions, np.nan), covariance,
-                      years, flux, found,
+                      years, flux, velocity, found,
                       found & is_definite_2x2(covariance))
 
 

@@ -12,7 +12,7 @@ from photutils_mgauss.motions.joint import (
     solve_all,
     total_chi2,
 )
-from photutils_mgauss.motions.perspective import drift, refined
+from photutils_mgauss.motions.perspective import swerved
 from photutils_mgauss.motions.prepare import Setup, State
 from photutils_mgauss.motions.problem import MotionProblem
 from photutils_mgauss.motions.relative import remove_mean_fields
@@ -81,7 +81,7 @@ def pose(setup, state):
         stars, parallactic = setup.drift
         offsets[..., stars] -= parallactic
     if len(setup.nearing.stars):
-        offsets[..., setup.nearing.stars] -= drift(setup, state.space)
+        offsets[..., setup.nearing.stars] -= state.swerve
     np.nan_to_num(offsets, copy=False)
     return MotionProblem(
         offsets, weights, setup.origin, setup.dt,
@@ -113,11 +113,11 @@ def _step(setup, state):
     frames = solve_frames(problem, reduced, relative=setup.relative)
     maps = np.stack([setup.transform.project(one)
                      for one in state.maps + frames.correction])
-    space = state.space
+    swerve = state.swerve
     if len(setup.nearing.stars):
-        space = refined(setup, space, solve(
-            setup, problem.select(setup.nearing.stars), frames).values)
-    return problem, frames, replace(state, maps=maps, space=space)
+        found = solve(setup, problem.select(setup.nearing.stars), frames)
+        swerve = swerved(setup, swerve, found.values)
+    return problem, frames, replace(state, maps=maps, swerve=swerve)
 
 
 def _align(setup, state):
@@ -127,9 +127,9 @@ def _align(setup, state):
         problem, frames, after = _step(setup, state)
         # In units of a typical error.
         size = np.abs(frames.correction).sum(axis=2).max(initial=0) / typical
-        swerve = _swerve(setup, state.space, after.space) / typical
+        turned = np.abs(after.swerve - state.swerve).max(initial=0) / typical
         state = after
-        if size < CONVERGED and swerve < CONVERGED:
+        if size < CONVERGED and turned < CONVERGED:
             break
         if i > 5 and not size < before:
             msg = ('epochs must agree on which star is which, got frames '
@@ -138,13 +138,6 @@ def _align(setup, state):
             raise ValueError(msg)
         before = size
     return problem, frames, state
-
-
-def _swerve(setup, before, after):
-    """Return how far the stars of known radial velocity were moved."""
-    if not len(setup.nearing.stars):
-        return 0.0
-    return np.abs(drift(setup, after) - drift(setup, before)).max()
 
 
 def fit(setup, state):
@@ -243,7 +236,7 @@ def _discrepant(setup, problem, frames):
         return np.empty(0, dtype=int)
     alone = problem.select(stars)
     bound, free = (
-        total_chi2(one, solve(setup, one, frames, residuals=True))
+        solve(setup, one, frames, residuals=True).total
         for one in (alone, alone.unbound))
     rise = bound - free
     limit = chi2_limit(setup.options.clip, alone.ranks)
@@ -260,7 +253,7 @@ def _floors(setup, state, problem, frames, *, robust=False):
                            & ~np.isin(np.arange(problem.n_stars),
                                       state.dropped))
     estimates = solve(setup, problem.select(stars), frames, residuals=True,
-                       judge=True)
+                      judge=True)
     covariance = setup.sightings.covariance[..., stars]
     used = state.used[:, stars]
     return np.array([floor_variance(

@@ -375,8 +375,16 @@ def _stack(matches, names, detections):
             np.broadcast_to(year, one.found.shape)
             for year, one in zip(years, detections, strict=True)])
     return Detections(names, take('plane'), take('covariance'), years,
-                      take('flux'), take('found', False),
-                      take('usable', False))
+                      _mean(take('flux')), _mean(take('radial_velocity')),
+                      take('found', False), take('usable', False))
+
+
+def _mean(values):
+    """Return the means (n,) of what is known of stars at E epochs."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    return (np.where(known, values, 0.0).sum(axis=0)
+            / np.where(count, count, np.nan))
 
 
 def _is_by_id(detections, on_sky, how, unit):

@@ -1,15 +1,15 @@
 """
 Stars of known radial velocity: their motion and parallax change with time.
 
-While a fit iterates, what they move beyond a straight line is taken from
-their detections, with the motions and parallaxes found so far.
+While a fit iterates, what such stars move beyond the model of constant
+motions is taken from their detections, with the motions and parallaxes found
+so far.
 """
 from dataclasses import dataclass
 
 import numpy as np
 
-from photutils_mgauss.motions.references import carried
-from photutils_mgauss.sky.space_motion import beyond_straight
+from photutils_mgauss.sky.space_motion import swerve
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +17,7 @@ class Nearing:
     """
     The k stars whose approach or recession is known.
 
-    ``stars`` (k,) are their numbers, ``velocity`` (k,) their radial
+    ``stars`` (k,) are their sorted numbers, ``velocity`` (k,) their radial
     velocities [km/s], ``parallax`` (k,) what is known of their parallaxes
     beforehand [mas], 0 where that is nothing.
     """
@@ -26,90 +26,43 @@ class Nearing:
     velocity: np.ndarray
     parallax: np.ndarray
 
-    @classmethod
-    def none(cls):
-        """Return no stars at all."""
-        return cls(np.empty(0, dtype=int), np.empty(0), np.empty(0))
+    def values(self, which, found, origin):
+        """
+        Return positions, motions and parallaxes (5, k) of some of them.
+
+        Parameters
+        ----------
+        which : (k,) int `~numpy.ndarray`
+            Of the stars here.
+        found : (4 or 5, k) `~numpy.ndarray`
+            Their fitted parameters; parallaxes that are not fitted are those
+            known beforehand.
+        origin : (2, k) `~numpy.ndarray`
+            What fitted positions are relative to.
+        """
+        out = np.empty((5, len(which)))
+        out[4] = self.parallax[which]
+        out[:len(found)] = found
+        out[:2] += origin
+        return out
 
 
-def nearing_stars(sightings, options):
+def swerved(setup, before, found):
     """
-    Return the `Nearing` stars, and a sentence on those that are left out.
+    Return what nearing stars move beyond the model now, (2, E, k).
 
-    Without a parallax a radial velocity says nothing about a motion, and
-    the recipe of the paper knows of neither.
+    ``found`` (p, k) are their latest parameters; stars without a solution
+    move as ``before``.
     """
-    known = np.isfinite(sightings.radial_velocity)
-    if options.recipe == 'paper' or sightings.unit != 'mas':
-        return Nearing.none(), ()
-    parallax = np.full(len(known), np.nan)
-    parallax[sightings.references] = sightings.catalogue.values[4]
-    use = known & (np.isfinite(parallax) | bool(options.parallax))
-    left, notes = np.sum(known & ~use), ()
-    if left:
-        notes = (f'The radial velocity of {left} '
-                 f'{"star is" if left == 1 else "stars are"} not used, '
-                 'because the parallax is not known: give references with '
-                 'parallaxes, or fit them.',)
-    stars = np.flatnonzero(use)
-    return Nearing(stars, sightings.radial_velocity[stars],
-                   np.nan_to_num(parallax[stars])), notes
-
-
-def first_values(nearing, sightings, origin, working_year):
-    """
-    Return position, motion and parallax (5, k) of nearing stars.
-
-    Those of the catalogue at the working epoch; stars that it does not know
-    stand still at first.
-    """
-    values = np.zeros((5, len(nearing.stars)))
-    values[:2], values[4] = origin[:, nearing.stars], nearing.parallax
-    catalogue = carried(sightings.catalogue, working_year)
-    place = {star: k for k, star in enumerate(sightings.references)}
-    for i, star in enumerate(nearing.stars):
-        if star in place:
-            known = catalogue.values[:, place[star]]
-            if np.isfinite(known).all():
-                values[:, i] = known
-    return values
-
-
-def drift(setup, values):
-    """
-    Return the displacements (2, E, k) of nearing stars beyond the model.
-
-    ``values`` (5, k) are their positions, motions and parallaxes at the
-    working epoch. The model has constant motions, and the parallax factors
-    of the places in the middle.
-    """
-    stars, plane = setup.nearing.stars, setup.sightings.plane
-    dt = setup.dt if setup.dt.shape[1] == 1 else setup.dt[:, stars]
-    values = values[:, None]
-    extra = beyond_straight(values, setup.nearing.velocity, dt)
-    out = extra[:2]
-    if plane is not None:
-        observer = setup.sightings.observer
-        if observer.shape[2] > 1:
-            observer = observer[..., stars]
-        place = values[:2] + values[2:4] * dt + extra[:2]
-        out = (out + (values[4] + extra[4])
-               * plane.parallax_factors(place, observer)
-               - values[4] * plane.parallax_factors(
-                   setup.origin[:, None, stars], observer))
-    return out
-
-
-def refined(setup, values, found):
-    """
-    Return values (5, k) of nearing stars from estimates (p, k) of theirs.
-
-    Parallaxes that are not fitted, and stars that have no solution, stay as
-    they are.
-    """
-    stars = setup.nearing.stars
+    nearing, stars = setup.nearing, setup.nearing.stars
+    dt, observer = setup.dt, setup.sightings.observer
+    if dt.shape[1] > 1:
+        dt = dt[:, stars]
+    if observer is not None and observer.shape[2] > 1:
+        observer = observer[..., stars]
     size = 5 if setup.options.parallax else 4
-    new = values.copy()
-    new[:size] = found[:size]
-    new[:2] += setup.origin[:, stars]
-    return np.where(np.isfinite(found).all(axis=0), new, values)
+    origin = setup.origin[:, stars]
+    values = nearing.values(np.arange(len(stars)), found[:size], origin)
+    out = swerve(values, nearing.velocity, dt, origin, setup.sightings.plane,
+                 observer)
+    return np.where(np.isfinite(out).all(axis=(0, 1)), out, before)

@@ -5,17 +5,12 @@ import astropy.units as u
 import numpy as np
 
 from photutils_mgauss.motions.assemble import Sightings
-from photutils_mgauss.motions.perspective import (
-    Nearing,
-    first_values,
-    nearing_stars,
-)
+from photutils_mgauss.motions.perspective import Nearing
 from photutils_mgauss.motions.priors import (
     Priors,
     add_parallax_prior,
     build_priors,
 )
-from photutils_mgauss.motions.references import carried
 from photutils_mgauss.sky.transforms import Transform
 
 
@@ -107,8 +102,8 @@ class State:
     ``maps`` (E, 2, b), ``used`` (E, n), ``floor`` (E,) variances per axis,
     ``dropped`` (k,) stars that are references no longer, ``untied`` (n,)
     stars whose detections disagree too much to find the frames with,
-    ``space`` (5, k) positions, motions and parallaxes of the stars of known
-    radial velocity, at the working epoch.
+    ``swerve`` (2, E, k) what stars of known radial velocity move beyond the
+    model.
     """
 
     maps: np.ndarray
@@ -116,7 +111,7 @@ class State:
     floor: np.ndarray
     dropped: np.ndarray
     untied: np.ndarray
-    space: np.ndarray
+    swerve: np.ndarray
 
 
 def prepare(sightings, options):
@@ -137,12 +132,9 @@ def prepare(sightings, options):
     _check_references(sightings, anchors, untied, relative, options.transform)
     origin, transform = _field(sightings, options.transform, ~untied)
     drift = _drift(sightings, origin, options)
-    nearing, notes = nearing_stars(sightings, options)
+    nearing, notes = _nearing(sightings, options)
     use = ~np.isin(stars, held)
-    known = catalogue
-    if len(nearing.stars):
-        known = carried(catalogue, working)
-    priors = build_priors(known.select(use), stars[use],
+    priors = build_priors(catalogue.select(use), stars[use],
                           origin[:, stars[use]], working, sightings.unit,
                           options.n_star_parameters)
     if options.parallax == 'prior':
@@ -155,7 +147,7 @@ def prepare(sightings, options):
                   np.median(variance) if variance.size else 1.0),
             State(maps, sightings.usable.copy(), floor,
                   np.empty(0, dtype=int), untied,
-                  first_values(nearing, sightings, origin, working)))
+                  np.zeros((2, len(dt), len(nearing.stars)))))
 
 
 def _check_parallax(options, sightings):
@@ -239,10 +231,34 @@ def _field(sightings, transform, sound):
     with np.errstate(invalid='ignore'):
         origin = (np.nansum(sightings.places, axis=1)
                   / np.where(count, count, np.nan))
-    transform = transform.fitted_to(origin[:, sound] if sound.any()
-                                    else origin)
+    inside = np.where(sound | ~sound.any(), origin, np.nan)
+    transform = transform.fitted_to(inside)
     return np.where(np.isfinite(origin), origin,
                     np.reshape(transform.centre, (2, 1))), transform
+
+
+def _nearing(sightings, options):
+    """
+    Return the `Nearing` stars, and a sentence on those that are left out.
+
+    Without a parallax a radial velocity says nothing about a motion, and
+    the recipe of the paper knows of neither.
+    """
+    parallax = np.full(len(sightings.names), np.nan)
+    parallax[sightings.references] = sightings.catalogue.values[4]
+    known = np.isfinite(sightings.radial_velocity)
+    if options.recipe == 'paper' or sightings.unit != 'mas':
+        known[:] = False
+    use = known & (np.isfinite(parallax) | bool(options.parallax))
+    stars, left = np.flatnonzero(use), np.sum(known & ~use)
+    nearing = Nearing(stars, sightings.radial_velocity[stars],
+                      np.nan_to_num(parallax[stars]))
+    if not left:
+        return nearing, ()
+    of = 'one star' if left == 1 else f'{left} stars'
+    note = (f'The radial velocity of {of} is not used, because the parallax '
+            'is not known: give references with parallaxes, or fit them.')
+    return nearing, (note,)
 
 
 def _drift(sightings, origin, options):

@@ -3,8 +3,12 @@ import numpy as np
 
 from photutils_mgauss.motions.joint import cross_covariance
 from photutils_mgauss.motions.problem import CHUNK
-from photutils_mgauss.sky.space_motion import beyond_straight, jacobian
-from photutils_mgauss.sky.tangent_plane import directions
+from photutils_mgauss.sky.space_motion import (
+    beyond_straight,
+    jacobian,
+    turned,
+    turns,
+)
 
 FROM_OURS = [0, 1, 4, 2, 3]  # to Gaia's order: position, parallax, motion
 
@@ -69,41 +73,15 @@ def _in_space(fit, year, stars):
     What is to be added to their first 4 or 5 parameters (size, k), and the
     matrices (p, p, k) that stand in the place of `_straight`.
     """
-    setup, nearing = fit.setup, fit.setup.nearing
-    size = 5 if setup.options.parallax else 4
+    nearing, dt = fit.setup.nearing, year - fit.setup.working_year
+    size = 5 if fit.setup.options.parallax else 4
     which = np.searchsorted(nearing.stars, stars)
-    velocity, dt = nearing.velocity[which], year - setup.working_year
-    values = np.empty((5, len(stars)))
-    values[4] = nearing.parallax[which]
-    values[:size] = fit.estimates.values[:size, stars]
-    values[:2] += setup.origin[:, stars]
+    velocity = nearing.velocity[which]
+    values = nearing.values(which, fit.estimates.values[:size, stars],
+                            fit.setup.origin[:, stars])
     change = np.repeat(_straight(fit, year)[..., None], len(stars), axis=2)
     change[:size, :size] = jacobian(values, velocity, dt)[:size, :size]
     return beyond_straight(values, velocity, dt)[:size], change
-
-
-def turned(plane, values, covariance):
-    """
-    Return values and covariances in local axes instead of the plane's.
-
-    The position becomes right ascension and declination [deg], its
-    covariance turns.
-    """
-    turn = _turns(plane, values[:2], len(values))
-    moved = np.einsum('ijn,jn->in', turn, values)
-    moved[:2] = directions(plane.deproject(values[:2]))
-    half = np.einsum('ijn,jkn->ikn', turn, covariance)
-    return moved, np.einsum('ijn,kjn->ikn', half, turn)
-
-
-def _turns(plane, places, size):
-    """Return the matrices (p, p, n) from the plane's axes to local ones."""
-    inverse = plane.local_inverse(places)
-    turn = np.zeros((size, size, places.shape[1]))
-    turn[np.arange(size), np.arange(size)] = 1.0
-    for k in [0, 2] + [size - 2] * (size > 5):
-        turn[k:k + 2, k:k + 2] = inverse
-    return turn
 
 
 def star_covariance(fit, stars, ref_year):
@@ -119,7 +97,7 @@ def star_covariance(fit, stars, ref_year):
     plane = fit.setup.sightings.plane
     if plane is not None:
         places = at_epoch(fit, ref_year, stars)[0][:2]
-        change = _turns(plane, places, size).transpose(2, 0, 1) @ change
+        change = turns(plane, places, size).transpose(2, 0, 1) @ change
     covariance = np.einsum('kij,kjlm,lnm->kiln', change, covariance, change)
     order = [k for k in FROM_OURS if k < size] if (
         fit.setup.options.parallax) else [0, 1, 2, 3]

@@ -17,7 +17,7 @@ from photutils_mgauss.motions.epoch import (
 )
 from photutils_mgauss.motions.stacked import apply
 from photutils_mgauss.sky.observers import julian_years
-from photutils_mgauss.sky.space_motion import jacobian, moved
+from photutils_mgauss.sky.space_motion import carried
 from photutils_mgauss.utils.star_columns import find_column
 
 CLASSES = ('qso', 'galaxy', 'star', 'position')
@@ -53,6 +53,18 @@ class Catalogue:
     def fixed(self):
         """Which objects neither move nor have a parallax, (k,)."""
         return np.isin(self.kinds, FIXED)
+
+    def at(self, year):
+        """
+        Return the objects with all motions in space carried to a year.
+
+        Only stars of known motion, parallax and radial velocity do not move
+        along straight lines; all others stay as they are.
+        """
+        values, covariance, years = carried(
+            self.values, self.covariance, self.radial_velocity, self.year,
+            year)
+        return replace(self, values=values, covariance=covariance, year=years)
 
     def select(self, which):
         """Return some of the objects, without their identifiers."""
@@ -171,29 +183,3 @@ def _check_motions(kinds, values):
                f"none in row {np.flatnonzero(bad)[0]}; class 'position' is "
                'for stars of unknown motion')
         raise ValueError(msg)
-
-
-def carried(catalogue, year):
-    """
-    Return the catalogue with all motions in space carried to a year.
-
-    Only stars of known motion, parallax and radial velocity [mas, km/s] do
-    not move along straight lines; all others stay as they are.
-    """
-    space = (np.isfinite(catalogue.values).all(axis=0)
-             & np.isfinite(catalogue.radial_velocity + catalogue.year))
-    if not space.any():
-        return catalogue
-    old, velocity = (catalogue.values[:, space],
-                     catalogue.radial_velocity[space])
-    dt = year - catalogue.year[space]
-    turn = jacobian(old, velocity, dt)
-    covariance = catalogue.covariance.copy()
-    # A parallax without an error is taken as it is.
-    turn[:4, 4] *= covariance[4, 4, space] < 1e-3 * UNKNOWN
-    values, years = catalogue.values.copy(), catalogue.year.copy()
-    values[:, space], years[space] = moved(old, velocity, dt), year
-    covariance[..., space] = np.einsum(
-        'ijn,jkn,lkn->iln', turn, covariance[..., space], turn)
-    return replace(catalogue, values=values, covariance=covariance,
-                   year=years)

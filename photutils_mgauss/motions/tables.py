@@ -6,7 +6,6 @@ from astropy.table import QTable
 from photutils_mgauss.motions.joint import solve_all
 from photutils_mgauss.motions.loop import measured
 from photutils_mgauss.motions.propagation import FROM_OURS
-from photutils_mgauss.motions.references import carried
 from photutils_mgauss.motions.stacked import invert_2x2
 from photutils_mgauss.sky.tangent_plane import directions
 
@@ -83,7 +82,7 @@ def _catalogue_motions(sightings, stars, year):
     place = {star: k for k, star in enumerate(sightings.references)}
     catalogue = sightings.catalogue.select([place[star] for star in stars])
     if sightings.unit == 'mas':
-        catalogue = carried(catalogue, year)
+        catalogue = catalogue.at(year)
     motion = catalogue.motion()
     covariance = catalogue.covariance[2:4, 2:4] * ~catalogue.fixed
     if sightings.plane is not None:
@@ -109,7 +108,7 @@ def star_table(fit, ref_year, parameters):
     _add_quality(table, fit, solved)
     if fit.leak is not None:
         flags |= _add_leak(table, fit.leak, solved)
-    table['flux'] = _mean_flux(sightings.flux)
+    table['flux'] = sightings.flux
     if np.isfinite(sightings.radial_velocity).any():
         table['radial_velocity'] = sightings.radial_velocity * u.km / u.s
     table['reference'] = _reference_kinds(fit)
@@ -211,12 +210,6 @@ def _add_leak(table, leak, solved):
         table[f'{name}_per_parallax'] = np.where(solved, bias[k],
                                                  np.nan) / u.yr
     return 128 * (np.nan_to_num(strongest) > STRONG).astype(int)
-
-
-def _mean_flux(flux):
-    count = np.isfinite(flux).sum(axis=0)
-    with np.errstate(invalid='ignore'):
-        return np.nansum(flux, axis=0) / np.where(count, count, np.nan)
 
 
 def _reference_kinds(fit):

@@ -221,5 +221,5 @@ def test_radial_velocities_without_parallaxes_are_said_not_to_count(rng):
     epochs = barnard_epochs(rng, n_qso=30, radial_velocity=-110.47)
     solution = ProperMotionFitter(
         match_by='id', clip=None, references='qso').fit(epochs)
-    assert any('radial velocity of 1 star is not' in note
+    assert any('radial velocity of one star is not' in note
                for note in solution.notes)
