@@ -64,6 +64,8 @@ class Sightings:
         The star that each of them is.
     radial_velocity : (n,) `~numpy.ndarray`
         Of the stars [km/s], NaN where it is not known.
+    doubts : tuple of str
+        What shows that the references are not those of these stars.
     notes : tuple of str
         Epochs that have few stars in common with the others, in sentences.
     """
@@ -85,6 +87,7 @@ class Sightings:
     catalogue: Catalogue
     references: np.ndarray
     radial_velocity: np.ndarray
+    doubts: tuple
     notes: tuple
 
 
@@ -127,7 +130,23 @@ def assemble(epochs, references, how, transform):
     return Sightings(epochs, plane, unit, every.ids, matches, places,
                      covariance, every.years, years, tdb(years), observer,
                      every.usable, every.flux, ties, catalogue, stars,
-                     velocity, _few_in_common(matches.seen))
+                     velocity, _not_there(references, stars),
+                     _few_in_common(matches.seen))
+
+
+def _not_there(references, stars):
+    """Return a sentence if references were given and no star is one."""
+    if references is None or len(stars):
+        return ()
+    if isinstance(references, str):
+        what = f'The column {references!r} marks no star'
+    else:
+        what = (f'None of the {len(references)} reference objects is among '
+                'the stars')
+    sentence = (f'{what}, so nothing ties the motions to references: do they '
+                'have the identifiers of the epochs, or places in this '
+                'field?')
+    return (sentence,)
 
 
 def _few_in_common(seen):

@@ -240,7 +240,8 @@ def _discrepant(setup, problem, frames):
         for one in (alone, alone.unbound))
     rise = bound - free
     limit = chi2_limit(setup.options.clip, alone.ranks)
-    worst = np.nan_to_num(rise / limit, nan=0.0)
+    worst = np.nan_to_num(np.divide(rise, limit, where=limit > 0,
+                                    out=np.zeros_like(rise)), nan=0.0)
     # A few at a time: one bad reference pulls the frame from the others.
     most = max(1, len(stars) // 20)
     chosen = np.argsort(worst)[::-1][:most]

@@ -503,10 +503,6 @@ def find_references(catalogue, detections, years, tolerance):
     """
     if catalogue.ids is not None:
         return _lookup(catalogue.ids, detections.ids)
-    if not np.isfinite(catalogue.values[:2]).all(axis=0).any():
-        msg = ("references must have a column 'id' or positions to be found "
-               'among the stars')
-        raise ValueError(msg)
     found = np.full(len(catalogue.kinds), -1)
     for e, year in enumerate(years):
         # Epoch by epoch: frames that differ would blur a star's mean place.

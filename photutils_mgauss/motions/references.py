@@ -86,6 +86,7 @@ def quasars(n):
 def read_catalogue(table, plane, unit):
     """Return the `Catalogue` of a table of references."""
     n = len(table)
+    _check_findable(table, plane)
     kinds = _kinds(table)
     years = _years(table, kinds)
     values = np.full((5, n), np.nan)
@@ -108,6 +109,14 @@ def read_catalogue(table, plane, unit):
         values[2:4] = apply(turn[2:4, 2:4], values[2:4])
         covariance = np.einsum('ijn,jkn,lkn->iln', turn, covariance, turn)
     return Catalogue(ids, kinds, values, covariance, years, velocity)
+
+
+def _check_findable(table, plane):
+    x = ('ra',) if plane is not None else names_of('x')
+    if 'id' not in table.colnames and find_column(table, x) is None:
+        msg = ("references must have a column 'id' or positions to be found "
+               'among the stars')
+        raise ValueError(msg)
 
 
 def _unit(unit):
