@@ -12,6 +12,7 @@ from helpers.motion_scenes import (
     plane_epochs,
     rms,
 )
+from helpers.wcs import tan_wcs
 from photutils_mgauss import Epoch, ProperMotionFitter, decode_motion_flags
 
 
@@ -205,3 +206,90 @@ def test_epochs_in_pixels_take_a_radius_and_systematic_errors_in_pixels(rng):
         systematic=0.001 * u.pix).fit(epochs).stars
     assert len(stars) == motion.shape[1]
     assert str(stars['pmra'].unit) == 'pix / yr'
+
+
+def sky_epochs(rng, kind, n=60):
+    """Return epochs with a WCS, or with ra and dec, that have all columns."""
+    wcs = tan_wcs(150, 2)
+    place, motion = rng.uniform(0, 1000, (2, n)), rng.normal(0, 0.01, (2, n))
+    motion[:, 20:40] = 0
+    epochs = []
+    for year in (2020.0, 2021.0, 2022.5):
+        x, y = place + motion * (year - 2020) + rng.normal(0, 0.01, (2, n))
+        table = Table({'id': np.arange(n), 'flux_fit': np.ones(n),
+                       'time': np.full(n, year)})
+        if kind == 'pixels':
+            table['x_fit'], table['y_fit'] = x, y
+            table['x_err'] = table['y_err'] = 0.01
+            table['xy_cov'] = 0.0
+        else:
+            table['ra'], table['dec'] = wcs.all_pix2world(x, y, 0)
+            table['ra_error'] = table['dec_error'] = 0.7
+        epochs.append(Epoch(table, wcs if kind == 'pixels' else None))
+    return epochs
+
+
+@pytest.mark.parametrize(('kind', 'column'), [
+    ('pixels', 'x_fit'), ('pixels', 'y_err'), ('pixels', 'xy_cov'),
+    ('pixels', 'time'), ('pixels', 'flux_fit'), ('sky', 'ra'),
+    ('sky', 'dec'), ('sky', 'ra_error'), ('sky', 'time')])
+@pytest.mark.parametrize('value', [np.inf, -np.inf, np.nan])
+def test_one_bad_number_costs_its_own_detection(rng, kind, column, value):
+    epochs = sky_epochs(rng, kind)
+    damaged, without = (changed(epochs[1]) for _ in range(2))
+    damaged.table[column][3] = value
+    if column != 'flux_fit':
+        without.table.remove_row(3)
+    fitter = ProperMotionFitter(references=list(range(20, 40)))
+    got, expected = (fitter.fit([epochs[0], one, epochs[2]]).stars
+                     for one in (damaged, without))
+    for table in (got, expected):
+        table.sort('id')
+    for name in ('ra', 'dec', 'pmra', 'pmdec', 'pmra_error', 'flux'):
+        assert np.isfinite(got[name]).all()
+        assert_allclose(got[name].value if got[name].unit else got[name],
+                        expected[name].value if expected[name].unit
+                        else expected[name], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(('kind', 'column', 'value'), [
+    ('pixels', 'x_fit', 1e20), ('sky', 'dec', 1e6), ('sky', 'ra', 1e20)])
+def test_a_wild_place_leaves_the_others_alone(rng, kind, column, value):
+    epochs = sky_epochs(rng, kind)
+    damaged = changed(epochs[1])
+    damaged.table[column][3] = value
+    fitter = ProperMotionFitter(references=list(range(20, 40)))
+    clean, got = (fitter.fit([epochs[0], one, epochs[2]])
+                  for one in (epochs[1], damaged))
+    others = clean.stars['id'] != 3
+    # It was one of sixty that tied the frames.
+    assert_allclose(got.stars['pmra'][others].value,
+                    clean.stars['pmra'][others].value, atol=0.02)
+    assert got.stars['flags'][3] & (4 | 512)
+    assert not got.alignment['wcs_residual'].value.max() > 1e-4
+
+
+def test_a_wild_place_on_a_plane_leaves_the_others_alone(rng):
+    epochs, motion = plane_epochs(rng, 60)
+    epochs[1].table['x_fit'][3] = 1e20
+    got = ProperMotionFitter().fit(epochs).stars
+    away = np.delete(got['pmra'].value - motion[0], 3)
+    assert_allclose(away - np.median(away), 0, atol=0.04)
+
+
+def test_a_reference_of_unknown_place_keeps_its_motion(rng):
+    epochs = sky_epochs(rng, 'sky')
+    table = epochs[0].table
+    references = Table({
+        'id': np.arange(20, 40), 'ra': table['ra'][20:40],
+        'dec': table['dec'][20:40], 'pmra': np.full(20, 3.0),
+        'pmdec': np.full(20, -2.0), 'ref_epoch': np.full(20, 2020.0)})
+    for name in ('ra', 'dec', 'pmra', 'pmdec'):
+        references[f'{name}_error'] = 0.01
+    references['ra'][0] = np.inf
+    references['parallax'] = np.where(np.arange(20) == 1, np.inf, 0.1)
+    references['parallax_error'] = np.where(np.arange(20) == 2, np.inf, 0.1)
+    stars = ProperMotionFitter(references=references, clip=None,
+                               systematic=None).fit(epochs).stars
+    assert np.isfinite(stars['pmra']).all()
+    assert_allclose(stars['pmra'][20:23].value, 3.0, atol=0.05)
