@@ -8,6 +8,7 @@ from photutils_mgauss.motions.loop import measured
 from photutils_mgauss.motions.propagation import FROM_OURS
 from photutils_mgauss.motions.stacked import invert_2x2
 from photutils_mgauss.sky.tangent_plane import directions
+from photutils_mgauss.utils.star_columns import words_column
 
 # What each bit of a star's flags means.
 FLAGS = {
@@ -111,7 +112,7 @@ def star_table(fit, ref_year, parameters):
     table['flux'] = sightings.flux
     if np.isfinite(sightings.radial_velocity).any():
         table['radial_velocity'] = sightings.radial_velocity * u.km / u.s
-    table['reference'] = _reference_kinds(fit)
+    table['reference'] = words_column(_reference_kinds(fit))
     table['flags'] = flags
     table.meta['TIMESYS'] = 'TDB'
     return table

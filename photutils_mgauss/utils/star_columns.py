@@ -3,7 +3,7 @@ from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
-from astropy.table import Table
+from astropy.table import MaskedColumn, Table
 
 # What may stand behind x, y and flux in the names of columns, in order of
 # preference.
@@ -58,6 +58,18 @@ def _selected(table):
     if 'selected' not in table.colnames:
         return np.ones(len(table), bool)
     return np.asarray(np.ma.filled(table['selected'], False), bool)
+
+
+def words_column(words):
+    """
+    Return a column of words, empty ones included, none of them masked.
+
+    ECSV takes the empty words of other columns for missing ones when they
+    are read again.
+    """
+    column = MaskedColumn(words)
+    column.info.serialize_method['ecsv'] = 'data_mask'
+    return column
 
 
 def find_column(table, names):

@@ -639,3 +639,15 @@ def test_times_of_single_rows_are_used(rng):
     assert_allclose(motion, 3.0, atol=0.02)
 
 
+
+
+def test_what_is_no_reference_is_so_after_a_file_too(solution, tmp_path):
+    path = tmp_path / 'motions.ecsv'
+    some = solution.stars[5:].copy()
+    for table in (solution.stars, some):
+        table.write(path, overwrite=True)
+        again = QTable.read(path)
+        assert not np.ma.getmaskarray(again['reference']).any()
+        assert (again['reference'] == '').sum() == (
+            table['reference'] == '').sum() > 0
+        assert list(again['reference']) == list(table['reference'])
