@@ -34,6 +34,8 @@ class Catalogue:
 
     ``values`` (5, k) and ``covariance`` (5, 5, k) are position, motion and
     parallax on the plane [unit, unit/yr], at Julian years ``year`` (k,).
+    ``rows`` (k,) are those of the user's table, -1 without one, and
+    ``source_ids`` (k,) what it calls the objects, if it does.
     """
 
     ids: np.ndarray | None
@@ -42,6 +44,8 @@ class Catalogue:
     covariance: np.ndarray
     year: np.ndarray
     radial_velocity: np.ndarray
+    rows: np.ndarray
+    source_ids: np.ndarray | None
 
     def motion(self):
         """Return motions (2, k) as far as they are known."""
@@ -72,7 +76,10 @@ class Catalogue:
             self, ids=None, kinds=self.kinds[which],
             values=self.values[:, which],
             covariance=self.covariance[..., which], year=self.year[which],
-            radial_velocity=self.radial_velocity[which])
+            radial_velocity=self.radial_velocity[which],
+            rows=self.rows[which],
+            source_ids=(None if self.source_ids is None
+                        else self.source_ids[which]))
 
 
 def quasars(n):
@@ -80,7 +87,7 @@ def quasars(n):
     nothing = np.full(n, np.nan)
     return Catalogue(None, np.full(n, 'qso'), np.full((5, n), np.nan),
                      np.repeat(UNKNOWN * np.eye(5)[..., None], n, axis=2),
-                     nothing, nothing)
+                     nothing, nothing, np.full(n, -1), None)
 
 
 def read_catalogue(table, plane, unit):
@@ -108,7 +115,10 @@ def read_catalogue(table, plane, unit):
         turn[4, 4] = 1
         values[2:4] = apply(turn[2:4, 2:4], values[2:4])
         covariance = np.einsum('ijn,jkn,lkn->iln', turn, covariance, turn)
-    return Catalogue(ids, kinds, values, covariance, years, velocity)
+    names = (np.asarray(table['source_id'])
+             if 'source_id' in table.colnames else None)
+    return Catalogue(ids, kinds, values, covariance, years, velocity,
+                     np.arange(n), names)
 
 
 def _check_findable(table, plane):

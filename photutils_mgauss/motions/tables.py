@@ -1,7 +1,7 @@
 """The tables of a solution, with the Gaia catalogue's column names."""
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import MaskedColumn, QTable
 
 from photutils_mgauss.motions.joint import solve_all
 from photutils_mgauss.motions.loop import measured
@@ -112,7 +112,8 @@ def star_table(fit, ref_year, parameters):
     table['flux'] = sightings.flux
     if np.isfinite(sightings.radial_velocity).any():
         table['radial_velocity'] = sightings.radial_velocity * u.km / u.s
-    table['reference'] = words_column(_reference_kinds(fit))
+    table['reference'] = _reference_kinds(fit)
+    _add_references(table, sightings)
     table['flags'] = flags
     table.meta['TIMESYS'] = 'TDB'
     return table
@@ -219,7 +220,21 @@ def _reference_kinds(fit):
     out[sightings.references] = sightings.catalogue.kinds
     out[setup.held] = ''
     out[fit.state.dropped] = ''
-    return out
+    return words_column(out)
+
+
+def _add_references(table, sightings):
+    """Add where each reference object is in the table of references."""
+    stars, catalogue = sightings.references, sightings.catalogue
+    if (catalogue.rows < 0).any() or not len(stars):
+        return
+    rows = np.full(len(table), -1)
+    rows[stars] = catalogue.rows
+    table['reference_row'] = rows
+    if catalogue.source_ids is not None:
+        names = np.zeros(len(table), dtype=catalogue.source_ids.dtype)
+        names[stars] = catalogue.source_ids
+        table['source_id'] = MaskedColumn(names, mask=rows < 0)
 
 
 def alignment_table(fit, wcs_residuals):

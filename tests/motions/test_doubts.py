@@ -184,3 +184,32 @@ def test_the_recipe_of_the_paper_has_no_systematic_errors(scene):
     epochs, catalogue = scene
     _, said = fit(epochs, catalogue, recipe='paper')
     assert said == []
+
+
+@pytest.mark.parametrize('by_place', [False, True])
+def test_a_reference_is_led_back_to_its_row(scene, by_place, tmp_path):
+    epochs, catalogue = scene
+    catalogue = catalogue[::-1][:40]
+    catalogue['source_id'] = 4_000_000_000_000_000_000 + np.asarray(
+        catalogue['id'])
+    places = catalogue['ra'].value
+    if by_place:
+        catalogue.remove_column('id')
+    solution, _ = fit(epochs, catalogue)
+    path = tmp_path / 'motions.ecsv'
+    solution.stars.write(path)
+    for stars in (solution.stars, QTable.read(path)):
+        known = np.asarray(stars['reference_row']) >= 0
+        assert known.sum() == 40
+        assert (known == (np.asarray(stars['reference']) == 'star')).all()
+        rows = np.asarray(stars['reference_row'])[known]
+        assert np.abs(places[rows] - stars['ra'].value[known]).max() < 1e-5
+        assert (np.asarray(stars['source_id'])[known]
+                == catalogue['source_id'][rows]).all()
+        assert np.ma.getmaskarray(stars['source_id'])[~known].all()
+
+
+def test_without_a_table_there_are_no_rows_of_it(scene):
+    epochs, _ = scene
+    solution, _ = fit(epochs, list(range(10)))
+    assert 'reference_row' not in solution.stars.colnames

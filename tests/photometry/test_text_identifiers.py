@@ -11,7 +11,7 @@ from photutils_mgauss import MixturePSFPhotometry
 
 @pytest.fixture
 def scene(rng):
-    """An image, its error, and a table with numbers."""
+    """Return an image, its error, and a table with numbers."""
     stars = QTable({'id': [2, 1, 4, 3], 'x': [12.3, 40.1, 25.2, 29.0],
                     'y': [20.1, 41.7, 9.5, 10.2],
                     'flux': [5e3, 4e3, 6e3, 3e3]})
@@ -43,5 +43,5 @@ def test_words_name_stars_as_numbers_do(scene, grouper, kind):
 def test_a_name_given_twice_is_an_error(scene):
     data, error, stars = scene
     stars['id'] = ['a', 'b', 'a', 'c']
-    with pytest.raises(ValueError, match="unique values of id, got 'a' 2|a 2"):
+    with pytest.raises(ValueError, match='unique values of id, got a 2 times'):
         MixturePSFPhotometry(PSF, 9)(data, error=error, init_params=stars)
