@@ -5,6 +5,7 @@ from photutils_mgauss.sky.space_motion import UNKNOWN
 
 FAR = 7.0     # times the detections' errors: no systematic error is so large
 DISTANT = 60e3  # mas: no pointing is off by more
+SOME = 8      # detections of an epoch of which a quarter says anything
 MANY = 0.25   # part of what was given that may be rejected without a word
 
 CHECK = ('check that they are the right objects, and the epoch, the units '
@@ -28,7 +29,8 @@ def doubts(fit):
 def remarks(fit):
     """Return what else is not as it should be, a tuple of str."""
     return (*_without_errors(fit), *_far_away(fit), *_misfit(fit),
-            *_lost_detections(fit), *_no_straight_motions(fit))
+            *_lost_detections(fit), *_unfinished(fit),
+            *_no_straight_motions(fit))
 
 
 def _large_floor(fit):
@@ -121,16 +123,24 @@ def _lost_references(fit):
 
 def _lost_detections(fit):
     usable, used = fit.setup.sightings.usable, fit.state.used
-    lost = (usable & ~used).sum(axis=1)
-    many = np.flatnonzero(lost > MANY * usable.sum(axis=1))
-    if many.size:
-        epochs = ', '.join(
-            f'{lost[e]} of the {usable[e].sum()} detections of epoch {e}'
-            for e in many)
-        yield (f'More than a quarter was rejected as outliers: {epochs}. '
-               'Check the errors of the detections, which may be too small '
-               'or in another unit, and whether rows of one star are of '
-               'different ones.')
+    lost, whole = (usable & ~used).sum(axis=1), usable.sum(axis=1)
+    many = np.flatnonzero((lost > MANY * whole) & (whole >= SOME))
+    parts = [f'{lost[e]} of the {whole[e]} detections of epoch {e}'
+             for e in many]
+    if not parts and lost.sum() > MANY * whole.sum():
+        parts = [f'{lost.sum()} of all {whole.sum()} detections']
+    if parts:
+        yield (f'More than a quarter was rejected as outliers: '
+               f'{", ".join(parts)}. Check the errors of the detections, '
+               'which may be too small or in another unit, and whether rows '
+               'of one star are of different ones.')
+
+
+def _unfinished(fit):
+    if fit.state.unfinished:
+        yield ('The search for outliers was ended before it came to rest: '
+               'there may be more. Check the errors of the detections, or '
+               'give clip=None.')
 
 
 def _no_straight_motions(fit):

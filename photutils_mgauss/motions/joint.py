@@ -68,7 +68,7 @@ class EliminatedStars:
     def rows(self, k):
         """Return row k of Z of all stars, shape (M, n)."""
         z = self.coupling[k].swapaxes(0, 1)[:, :, None] * self.basis
-        return z.reshape(-1, z.shape[-1])
+        return z.reshape(np.prod(z.shape[:-1]), z.shape[-1])
 
 
 def eliminate(problem):

@@ -21,6 +21,7 @@ from photutils_mgauss.motions.stacked import invert_2x2
 CONVERGED = 1e-3  # of the median error of a detection
 MAX_ITERATIONS = 40
 SIGNIFICANT = 2.0  # standard deviations that call for a floor
+FEW, MANY = 10, 0.25  # detections of a star, and their part, to be rejected
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +150,8 @@ def fit(setup, state):
         state, changed = _review(setup, state, problem, frames)
         if not changed:
             break
+    else:
+        state = replace(state, unfinished=True)
     for _ in range(4 * setup.options.fits_floor):
         floor = _floors(setup, state, problem, frames)
         still = np.allclose(floor, state.floor, rtol=0.02,
@@ -196,13 +199,30 @@ def _review(setup, state, problem, frames):
         return replace(state, dropped=np.union1d(state.dropped,
                                                  dropped)), True
     estimates = solve(setup, problem, frames, judge=True)
-    bad = worst_outliers(estimates.chi2, state.used, _spare(problem, state),
+    bad = worst_outliers(estimates.chi2, state.used,
+                         _spare(problem, state) & ~state.crooked,
                          setup.options.clip)
     if bad.any():
-        return replace(state, used=state.used & ~bad), True
+        return _rejected(setup, state, bad), True
     untied = state.untied | _inconsistent(setup, problem, estimates)
     return replace(state, untied=untied), bool(
         (untied & ~state.untied).any())
+
+
+def _rejected(setup, state, bad):
+    """
+    Return the state without bad detections (E, n).
+
+    Where there are many, it is the star that does not move straight, and
+    what would be left of them is no better than what was rejected.
+    """
+    usable, used = setup.sightings.usable, state.used & ~bad
+    lost = (usable & ~used).sum(axis=0)
+    crooked = bad.any(axis=0) & (lost > FEW) & (
+        lost > MANY * usable.sum(axis=0))
+    return replace(state, used=np.where(crooked, usable, used),
+                   untied=state.untied | crooked,
+                   crooked=state.crooked | crooked)
 
 
 def _inconsistent(setup, problem, estimates):
@@ -253,6 +273,8 @@ def _floors(setup, state, problem, frames, *, robust=False):
     stars = np.flatnonzero(problem.ties & setup.anchors
                            & ~np.isin(np.arange(problem.n_stars),
                                       state.dropped))
+    if not len(stars):
+        return state.floor
     estimates = solve(setup, problem.select(stars), frames, residuals=True,
                       judge=True)
     covariance = setup.sightings.covariance[..., stars]
@@ -272,9 +294,9 @@ def worst_outliers(chi2, used, spare, clip):
     """
     Return which detections to reject now, (E, n): each star's worst.
 
-    Only one of a star's goes at a time, because a bad one spoils the
-    residuals of the good; and only where ``spare`` (n,) says the star has
-    detections enough to tell the bad one.
+    Only one of a star's goes at a time, or a twentieth of many, because a
+    bad one spoils the residuals of the good; and only where ``spare`` (n,)
+    says the star has detections enough to tell the bad one.
     """
     limit = chi2_limit(clip, 2)
     chi2 = np.where(used, np.nan_to_num(chi2, nan=0.0), 0.0)
@@ -282,6 +304,12 @@ def worst_outliers(chi2, used, spare, clip):
     out = np.zeros(used.shape, dtype=bool)
     stars = np.arange(used.shape[1])
     out[worst, stars] = (chi2[worst, stars] > limit) & spare
+    most = len(used) // 20
+    if most > 1:
+        # Those about as bad as the worst, which has spoilt the others.
+        rank = chi2.argsort(axis=0)[::-1].argsort(axis=0)
+        out |= ((rank < used.sum(axis=0) // 20) & spare
+                & (chi2 > np.maximum(limit, chi2.max(axis=0) / 4)))
     return out
 
 

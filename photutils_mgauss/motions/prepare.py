@@ -103,7 +103,9 @@ class State:
     ``dropped`` (k,) stars that are references no longer, ``untied`` (n,)
     stars whose detections disagree too much to find the frames with,
     ``swerve`` (2, E, k) what stars of known radial velocity move beyond the
-    model.
+    model, ``crooked`` (n,) stars that no straight motion explains, whose
+    detections are all kept, ``unfinished`` whether there may be outliers
+    left.
     """
 
     maps: np.ndarray
@@ -112,6 +114,8 @@ class State:
     dropped: np.ndarray
     untied: np.ndarray
     swerve: np.ndarray
+    crooked: np.ndarray
+    unfinished: bool = False
 
 
 def prepare(sightings, options):
@@ -147,7 +151,8 @@ def prepare(sightings, options):
                   np.median(variance) if variance.size else 1.0),
             State(maps, sightings.usable.copy(), floor,
                   np.empty(0, dtype=int), untied,
-                  np.zeros((2, len(dt), len(nearing.stars)))))
+                  np.zeros((2, len(dt), len(nearing.stars))),
+                  np.zeros(len(anchors), dtype=bool)))
 
 
 def _check_parallax(options, sightings):

@@ -293,3 +293,42 @@ def test_a_reference_of_unknown_place_keeps_its_motion(rng):
                                systematic=None).fit(epochs).stars
     assert np.isfinite(stars['pmra']).all()
     assert_allclose(stars['pmra'][20:23].value, 3.0, atol=0.05)
+
+
+def scans(rng, *, orbit=0.0, wild=0, n=300, error=0.1):
+    """Return many epochs of a star that moves by 3 mas/yr, and circles."""
+    years = 2014 + np.sort(rng.uniform(0, 5, n))
+    phase = 2 * np.pi * years / 11.6
+    east = 3 * (years - 2017) + orbit * np.cos(phase) + rng.normal(
+        0, error, n)
+    north = 0.6 * orbit * np.sin(phase) + rng.normal(0, error, n)
+    east[rng.choice(n, wild, replace=False)] += rng.normal(0, 1000, wild)
+    return [Epoch(Table({
+        'id': [1], 'ra': [294.8 + x / 3.6e6 / np.cos(np.radians(14.9))],
+        'dec': [14.9 + y / 3.6e6], 'ra_error': [error],
+        'dec_error': [error]}), time=year)
+        for year, x, y in zip(years, east, north, strict=True)]
+
+
+@pytest.mark.parametrize('orbit', [3.0, 25.0])
+def test_a_binary_keeps_its_detections_and_is_flagged(rng, orbit):
+    epochs = scans(rng, orbit=orbit)
+    fits = {clip: ProperMotionFitter(transform=None, clip=clip,
+                                     match_by='id').fit(epochs)
+            for clip in (None, 5.0)}
+    star, plain = (fits[clip].stars[0] for clip in (5.0, None))
+    assert [words.split(':')[0] for words in decode_motion_flags(
+        star['flags'])] == ['inconsistent']
+    assert star['n_good_obs'] == 300
+    assert star['pmra'] == plain['pmra']
+    assert any('one straight motion' in note for note in fits[5.0].notes)
+
+
+@pytest.mark.parametrize('wild', [1, 5, 60])
+def test_many_wild_detections_of_one_star_are_rejected(rng, wild):
+    star = ProperMotionFitter(transform=None, match_by='id').fit(
+        scans(rng, wild=wild)).stars[0]
+    # A few of the wild ones lie within five standard errors.
+    assert 300 - wild <= star['n_good_obs'] <= 300 - 0.9 * wild
+    assert abs(star['pmra'].value - 3) < 5 * star['pmra_error'].value
+    assert star['uwe'] < 1.2
