@@ -5,6 +5,7 @@ from astropy.table import QTable
 from photutils_mgauss.field.forms import mixture_arrays
 from photutils_mgauss.field.normal import model_stamps, to_vector
 from photutils_mgauss.utils.image import with_unit
+from photutils_mgauss.utils.star_columns import words_column
 from photutils_mgauss.utils.validation import as_real
 
 
@@ -126,7 +127,7 @@ def star_table(fit, sample):
     table['n_pixels_fit'] = n_pixels
     table['n_pixels_rejected'] = fit.deviant_pixels.sum(axis=(1, 2))
     table['used'] = problem.used
-    table['reason'] = np.array([
+    table['reason'] = words_column([
         sample.reasons[e][i] for e, i in zip(sample.exposure, sample.row,
                                              strict=True)])
     return table

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from photutils_mgauss.field.stamps import cut_stamps
 from photutils_mgauss.utils.image import read_level, read_pixels, with_unit
-from photutils_mgauss.utils.star_columns import read_sources
+from photutils_mgauss.utils.star_columns import read_sources, words_column
 from photutils_mgauss.utils.validation import as_integer, as_real
 
 __all__ = ['select_psf_stars']
@@ -111,7 +111,7 @@ def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
     _judge(table, isolation, saturation, min_snr)
     if max_stars is not None:
         _thin_out(table, max_stars, pixels.shape)
-    table['selected'] = table['reason'] == ''
+    table['selected'] = np.asarray(table['reason']) == ''
     table.remove_columns([name for name in table.colnames
                           if name.startswith('_')])
     for name in ('flux', 'peak'):
@@ -187,7 +187,7 @@ def _judge(table, isolation, saturation, min_snr):
     for name, applies in checks:
         reason[(reason == '') & np.asarray(applies)] = name
     reason[(reason == '') & _odd_shape(table['_core'], reason == '')] = 'shape'
-    table['reason'] = reason
+    table['reason'] = words_column(reason)
 
 
 def _has_neighbour(table, isolation):
@@ -216,7 +216,7 @@ def _odd_shape(core, candidates):
 
 def _thin_out(table, max_stars, shape):
     """Keep the brightest of each cell of the detector in turn."""
-    rows = np.flatnonzero(table['reason'] == '')
+    rows = np.flatnonzero(np.asarray(table['reason']) == '')
     if rows.size <= max_stars:
         return
     n = max(1, int(np.sqrt(max_stars / 4)))

@@ -53,13 +53,19 @@ class Sightings:
         Barycentric places of the observers [au], None without a plane.
     usable : (E, n) bool `~numpy.ndarray`
         Detections with finite positions and good errors.
-    flux : (E, n) `~numpy.ndarray`
+    flux : (n,) `~numpy.ndarray`
+        Mean flux of each star.
     ties : `~photutils_mgauss.motions.ties.Ties`
         What took the planes without WCS to the common one.
     catalogue : `Catalogue`
-        The reference objects that were seen.
+        The reference objects that were seen; motions in space are those of
+        the mean time of the epochs.
     references : (k,) int `~numpy.ndarray`
         The star that each of them is.
+    radial_velocity : (n,) `~numpy.ndarray`
+        Of the stars [km/s], NaN where it is not known.
+    doubts : tuple of str
+        What shows that the references are not those of these stars.
     notes : tuple of str
         Epochs that have few stars in common with the others, in sentences.
     """
@@ -80,6 +86,8 @@ class Sightings:
     ties: Ties
     catalogue: Catalogue
     references: np.ndarray
+    radial_velocity: np.ndarray
+    doubts: tuple
     notes: tuple
 
 
@@ -112,12 +120,33 @@ def assemble(epochs, references, how, transform):
                  else catalogue.select(seen))
     places, covariance, ties = tie_planes(every, years, catalogue, stars,
                                           on_sky, transform)
+    if unit == 'mas':
+        catalogue = catalogue.at(float(np.nanmean(years)))
+    velocity = every.radial_velocity.copy()
+    velocity[stars] = np.where(np.isfinite(catalogue.radial_velocity),
+                               catalogue.radial_velocity, velocity[stars])
     observer = None if plane is None else observer_positions(
         [epoch.observer for epoch in epochs], every.years)
     return Sightings(epochs, plane, unit, every.ids, matches, places,
                      covariance, every.years, years, tdb(years), observer,
                      every.usable, every.flux, ties, catalogue, stars,
+                     velocity, _not_there(references, stars),
                      _few_in_common(matches.seen))
+
+
+def _not_there(references, stars):
+    """Return a sentence if references were given and no star is one."""
+    if references is None or len(stars):
+        return ()
+    if isinstance(references, str):
+        what = f'The column {references!r} marks no star'
+    else:
+        what = (f'None of the {len(references)} reference objects is among '
+                'the stars')
+    sentence = (f'{what}, so nothing ties the motions to references: do they '
+                'have the identifiers of the epochs, or places in this '
+                'field?')
+    return (sentence,)
 
 
 def _few_in_common(seen):

@@ -24,23 +24,20 @@ from photutils_mgauss.sky.wcs import (
     pixel_jacobian,
     pixel_to_vectors,
 )
-from photutils_mgauss.utils import star_columns
+from photutils_mgauss.utils.star_columns import find_column, first_values
 
-# What is read, in order of preference, and the unit of a plain number.
+# Columns with more names than one, in order of preference.
 COLUMNS = {
     'x': ('x_fit', 'x'), 'y': ('y_fit', 'y'),
     'x_err': ('x_err', 'x_error'), 'y_err': ('y_err', 'y_error'),
-    'ra': ('ra',), 'dec': ('dec',),
     'ra_err': ('ra_error', 'ra_err'), 'dec_err': ('dec_error', 'dec_err'),
-    'xy_cov': ('xy_cov',), 'flux': ('flux_fit', 'flux'), 'id': ('id',),
-    'time': ('time',),
+    'flux': ('flux_fit', 'flux'),
 }
 
 
-def find_column(table, key):
-    """Return the name of the column that holds ``key``, or None."""
-    return next((name for name in COLUMNS[key] if name in table.colnames),
-                None)
+def names_of(key):
+    """Return the names that a column may have, the preferred one first."""
+    return COLUMNS.get(key, (key,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +57,11 @@ class Epoch:
           [mas], the first with the cosine of the declination in it, as in
           the Gaia catalogue (``ra_err`` and ``dec_err`` will do).
 
-        Optional columns: ``id`` (any type, unique), ``flux_fit``, and
-        ``time``, the time of each row. Columns may have other units.
-        Masked and non-finite positions are left out and flagged; errors
-        that are not positive get no weight and a flag.
+        Optional columns: ``id`` (any type, unique), ``flux_fit``,
+        ``radial_velocity`` [km/s], and ``time``, the time of each row.
+        Columns may have other units. Masked and non-finite positions are
+        left out and flagged; errors that are not positive get no weight
+        and a flag.
     wcs : APE 14 WCS, optional
         A gwcs or `astropy.wcs.WCS` with celestial axes, of which only the
         forward transform is used. Without one, pixels are coordinates in a
@@ -123,8 +121,8 @@ class Epoch:
     @property
     def is_pixels(self):
         """Whether positions are x, y, which win over ra, dec."""
-        has_xy = find_column(self.table, 'x') is not None
-        has_sky = find_column(self.table, 'ra') is not None
+        has_xy = find_column(self.table, names_of('x')) is not None
+        has_sky = 'ra' in self.table.colnames
         return has_xy and (self.wcs is not None or not has_sky)
 
     @property
@@ -133,12 +131,28 @@ class Epoch:
         return self.wcs is not None or not self.is_pixels
 
     @property
+    def plane_unit(self):
+        """The unit of its plane: 'pix', or 'mas' where angles are known."""
+        if self.is_sky or self.pixel_scale is not None:
+            return 'mas'
+        name = find_column(self.table, names_of('x'))
+        unit = getattr(self.table[name], 'unit', None)
+        if unit is not None and u.Unit(unit).is_equivalent(u.mas):
+            return 'mas'
+        return 'pix'
+
+    @property
+    def pixel_size(self):
+        """Units of its plane in a pixel, None for columns of angles."""
+        if self.pixel_scale is not None:
+            return _angle_per_pixel(self.pixel_scale)
+        return 1.0 if self.plane_unit == 'pix' else None
+
+    @property
     def years(self):
         """Julian years (TDB), a scalar or one per row."""
-        name = find_column(self.table, 'time')
         if self.time is None:
-            column = self.table[name]
-            return julian_years(column, 'the column time')
+            return julian_years(self.table['time'], 'the column time')
         return julian_years(self.time)
 
     @property
@@ -172,8 +186,8 @@ def _check_columns(table, is_pixels):
     wanted = (('x', 'y', 'x_err', 'y_err') if is_pixels
               else ('ra', 'dec', 'ra_err', 'dec_err'))
     for key in wanted:
-        if find_column(table, key) is None:
-            names = COLUMNS[key]
+        names = names_of(key)
+        if find_column(table, names) is None:
             if key == 'ra':  # The table has no positions of either kind.
                 names = (*COLUMNS['x'], *names)
             words = ' or '.join(repr(name) for name in names)
@@ -204,7 +218,7 @@ def _angle_per_pixel(scale):
 
 
 def _check_time(epoch):
-    if epoch.time is None and find_column(epoch.table, 'time') is None:
+    if epoch.time is None and 'time' not in epoch.table.colnames:
         msg = "time must be given, or the table must have a column 'time'"
         raise ValueError(msg)
     years = epoch.years
@@ -223,7 +237,8 @@ class Detections:
     What an epoch says about each of its n rows, as plain arrays.
 
     For n stars at E epochs the arrays have an axis of epochs before the
-    last, and ``ids`` (n,) are the names of the stars.
+    last, but ``ids`` (n,) are the names of the stars, and ``flux`` and
+    ``radial_velocity`` (n,) [km/s] their means.
 
     ``plane`` (2, n) and ``covariance`` (3, n: xx, xy, yy) are in the frame's
     unit, mas or pixels. ``found`` says which positions are finite,
@@ -235,34 +250,19 @@ class Detections:
     covariance: np.ndarray
     years: np.ndarray
     flux: np.ndarray
+    radial_velocity: np.ndarray
     found: np.ndarray
     usable: np.ndarray
 
 
 def numbers(table, key, unit=None):
     """
-    Return a column as float64, NaN where masked.
+    Return a column as float64; NaN where masked, infinite or missing.
 
     A column without unit is taken to be in ``unit``.
     """
-    return star_columns.column_values(table, find_column(table, key), unit)
-
-
-def plane_unit(epoch):
-    """Return 'mas' or 'pix', the unit an epoch without sky comes in."""
-    if epoch.is_sky or epoch.pixel_scale is not None:
-        return 'mas'
-    unit = getattr(epoch.table[find_column(epoch.table, 'x')], 'unit', None)
-    if unit is not None and u.Unit(unit).is_equivalent(u.mas):
-        return 'mas'
-    return 'pix'
-
-
-def pixel_size(epoch):
-    """Return plane units in a pixel of an epoch without sky, or None."""
-    if epoch.pixel_scale is not None:
-        return _angle_per_pixel(epoch.pixel_scale)
-    return 1.0 if plane_unit(epoch) == 'pix' else None
+    values = first_values(table, names_of(key), unit)
+    return np.where(np.isfinite(values), values, np.nan)
 
 
 def sky_vectors(epoch):
@@ -271,12 +271,18 @@ def sky_vectors(epoch):
         x, y = pixels(epoch)
         vectors = pixel_to_vectors(epoch.wcs, x, y)
     else:
-        vectors = unit_vectors(numbers(epoch.table, 'ra', u.deg),
-                               numbers(epoch.table, 'dec', u.deg))
+        vectors = table_vectors(epoch.table)
     velocity = observer_velocity(epoch.observer)
     if velocity is None:
         return vectors
     return remove_aberration(vectors, velocity)
+
+
+def table_vectors(table):
+    """Return ICRS unit vectors (3, n) of ra and dec, NaN for no places."""
+    dec = numbers(table, 'dec', u.deg)
+    return unit_vectors(numbers(table, 'ra', u.deg),
+                        np.where(np.abs(dec) <= 90, dec, np.nan))
 
 
 def pixels(epoch):
@@ -351,7 +357,7 @@ def _common_unit(epochs, references):
         unit = getattr(references['x'], 'unit', None)
         if unit is not None and unit.physical_type == 'angle':
             return 'mas'
-    units = {plane_unit(epoch) for epoch in epochs}
+    units = {epoch.plane_unit for epoch in epochs}
     if len(units) > 1:
         msg = ('epochs must all have a scale or none, got columns in '
                'pixels and in angles; give pixel_scale')
@@ -366,8 +372,9 @@ def read_epoch(epoch, plane=None, vectors=None):
     ``plane`` is the common `TangentPlane`, and ``vectors`` the directions
     already computed; both None where nothing is known about the sky.
     """
-    ids, flux = _ids(epoch.table), _flux(epoch.table)
     years = np.asarray(epoch.years, dtype=float)
+    ids, flux = _ids(epoch.table), numbers(epoch.table, 'flux')
+    velocity = numbers(epoch.table, 'radial_velocity', u.km / u.s)
     if vectors is None:
         positions, covariance = _read_plane(epoch)
     else:
@@ -375,16 +382,13 @@ def read_epoch(epoch, plane=None, vectors=None):
         covariance = _sky_covariance(epoch, plane, positions)
     found = np.isfinite(positions).all(axis=0) & np.isfinite(years)
     return Detections(ids, np.where(found, positions, np.nan), covariance,
-                      years, flux, found,
+                      years, flux, velocity, found,
                       found & is_definite_2x2(covariance))
 
 
 def _read_plane(epoch):
-    unit, scale = u.pix, 1.0
-    if plane_unit(epoch) == 'mas':
-        unit = u.mas
-        if epoch.pixel_scale is not None:
-            unit, scale = u.pix, _angle_per_pixel(epoch.pixel_scale)
+    size = epoch.pixel_size
+    unit, scale = (u.mas, 1.0) if size is None else (u.pix, size)
     x, y, dx, dy = (scale * numbers(epoch.table, key, unit)
                     for key in ('x', 'y', 'x_err', 'y_err'))
     covariance = _covariance(epoch.table, dx, dy, scale**2, unit**2)
@@ -394,7 +398,7 @@ def _read_plane(epoch):
 def _covariance(table, dx, dy, scale=1.0, unit=u.pix**2):
     """Return xx, xy, yy; errors that are not positive become NaN."""
     cross = np.zeros_like(dx)
-    if find_column(table, 'xy_cov') is not None:
+    if 'xy_cov' in table.colnames:
         cross = scale * numbers(table, 'xy_cov', unit)
     good = (dx > 0) & (dy > 0) & np.isfinite(dx) & np.isfinite(dy)
     return np.where(good, np.stack([dx * dx, cross, dy * dy]), np.nan)
@@ -415,23 +419,16 @@ def _sky_covariance(epoch, plane, positions):
 
 
 def _ids(table):
-    name = find_column(table, 'id')
-    if name is None:
+    if 'id' not in table.colnames:
         return None
-    if np.any(getattr(table[name], 'mask', False)):
+    if np.any(getattr(table['id'], 'mask', False)):
         msg = "the column 'id' must not have masked values"
         raise ValueError(msg)
-    ids = np.asarray(table[name])
+    ids = np.asarray(table['id'])
     values, counts = np.unique(ids, return_counts=True)
     if len(values) < len(ids):
         msg = (f"the column 'id' must hold unique values, got "
                f'{values[counts > 1][0]!r} {counts.max()} times')
         raise ValueError(msg)
     return ids
-
-
-def _flux(table):
-    if find_column(table, 'flux') is None:
-        return np.full(len(table), np.nan)
-    return numbers(table, 'flux')
 

@@ -31,7 +31,7 @@ evaluated at the mean place of a star, not at each measured one: the two agree
 once the maps have converged, and only with a common basis are shifts of all
 frames together exactly undetermined, as they must be.
 """
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial, reduce
 from operator import add
 
@@ -68,7 +68,7 @@ class EliminatedStars:
     def rows(self, k):
         """Return row k of Z of all stars, shape (M, n)."""
         z = self.coupling[k].swapaxes(0, 1)[:, :, None] * self.basis
-        return z.reshape(-1, z.shape[-1])
+        return z.reshape(np.prod(z.shape[:-1]), z.shape[-1])
 
 
 def eliminate(problem):
@@ -205,7 +205,8 @@ class Estimates:
     (E, n) has two degrees of freedom and takes into account that a
     detection pulls the fit towards itself, NaN where nothing can be said;
     ``raw`` (E, n) is the plain chi-square, and ``expected`` (E, n) what to
-    expect of that, 2 minus the leverage.
+    expect of that, 2 minus the leverage. ``total`` (n,) is the chi-square of
+    a star, what was known of it included.
     """
 
     values: np.ndarray
@@ -215,6 +216,7 @@ class Estimates:
     chi2: np.ndarray | None = None
     raw: np.ndarray | None = None
     expected: np.ndarray | None = None
+    total: np.ndarray | None = None
 
 
 def solve_stars(problem, correction, factor, *, residuals=False,
@@ -232,8 +234,11 @@ def solve_stars(problem, correction, factor, *, residuals=False,
         predicted = _predicted(stars, problem, factor, scaled)
     if judge:
         judged = _judge(away, predicted, problem.weights)
-    return Estimates(values, covariance, away if residuals else None,
-                     predicted if leverage else None, *judged)
+    found = Estimates(values, covariance, away if residuals else None,
+                      predicted if leverage else None, *judged)
+    if not residuals:
+        return found
+    return replace(found, total=total_chi2(problem, found))
 
 
 def _residuals(offsets, stars, values):

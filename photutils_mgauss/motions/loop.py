@@ -12,6 +12,7 @@ from photutils_mgauss.motions.joint import (
     solve_all,
     total_chi2,
 )
+from photutils_mgauss.motions.perspective import swerved
 from photutils_mgauss.motions.prepare import Setup, State
 from photutils_mgauss.motions.problem import MotionProblem
 from photutils_mgauss.motions.relative import remove_mean_fields
@@ -20,6 +21,7 @@ from photutils_mgauss.motions.stacked import invert_2x2
 CONVERGED = 1e-3  # of the median error of a detection
 MAX_ITERATIONS = 40
 SIGNIFICANT = 2.0  # standard deviations that call for a floor
+FEW, MANY = 10, 0.25  # detections of a star, and their part, to be rejected
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +79,10 @@ def pose(setup, state):
         covariance = measured(setup, state, e)
         weights[:, e] = np.where(state.used[e], invert_2x2(*covariance), 0.0)
     if setup.drift is not None:
-        stars, drift = setup.drift
-        offsets[..., stars] -= drift
+        stars, parallactic = setup.drift
+        offsets[..., stars] -= parallactic
+    if len(setup.nearing.stars):
+        offsets[..., setup.nearing.stars] -= state.swerve
     np.nan_to_num(offsets, copy=False)
     return MotionProblem(
         offsets, weights, setup.origin, setup.dt,
@@ -110,17 +114,23 @@ def _step(setup, state):
     frames = solve_frames(problem, reduced, relative=setup.relative)
     maps = np.stack([setup.transform.project(one)
                      for one in state.maps + frames.correction])
-    return problem, frames, replace(state, maps=maps)
+    swerve = state.swerve
+    if len(setup.nearing.stars):
+        found = solve(setup, problem.select(setup.nearing.stars), frames)
+        swerve = swerved(setup, swerve, found.values)
+    return problem, frames, replace(state, maps=maps, swerve=swerve)
 
 
 def _align(setup, state):
     """Iterate until the maps stand still."""
     before, typical = np.inf, np.sqrt(setup.typical_variance)
     for i in range(MAX_ITERATIONS):
-        problem, frames, state = _step(setup, state)
+        problem, frames, after = _step(setup, state)
         # In units of a typical error.
         size = np.abs(frames.correction).sum(axis=2).max(initial=0) / typical
-        if size < CONVERGED:
+        turned = np.abs(after.swerve - state.swerve).max(initial=0) / typical
+        state = after
+        if size < CONVERGED and turned < CONVERGED:
             break
         if i > 5 and not size < before:
             msg = ('epochs must agree on which star is which, got frames '
@@ -140,6 +150,8 @@ def fit(setup, state):
         state, changed = _review(setup, state, problem, frames)
         if not changed:
             break
+    else:
+        state = replace(state, unfinished=True)
     for _ in range(4 * setup.options.fits_floor):
         floor = _floors(setup, state, problem, frames)
         still = np.allclose(floor, state.floor, rtol=0.02,
@@ -150,9 +162,9 @@ def fit(setup, state):
             break
     estimates = solve(setup, problem, frames, residuals=True)
     if setup.relative and setup.transform.kind != 'none':
-        estimates, drift = remove_mean_fields(problem, frames, estimates,
-                                              setup.options)
-        state = replace(state, maps=state.maps - drift)
+        estimates, common = remove_mean_fields(problem, frames, estimates,
+                                               setup.options)
+        state = replace(state, maps=state.maps - common)
     return finished(setup, state, problem, frames, estimates)
 
 
@@ -187,13 +199,30 @@ def _review(setup, state, problem, frames):
         return replace(state, dropped=np.union1d(state.dropped,
                                                  dropped)), True
     estimates = solve(setup, problem, frames, judge=True)
-    bad = worst_outliers(estimates.chi2, state.used, _spare(problem, state),
+    bad = worst_outliers(estimates.chi2, state.used,
+                         _spare(problem, state) & ~state.crooked,
                          setup.options.clip)
     if bad.any():
-        return replace(state, used=state.used & ~bad), True
+        return _rejected(setup, state, bad), True
     untied = state.untied | _inconsistent(setup, problem, estimates)
     return replace(state, untied=untied), bool(
         (untied & ~state.untied).any())
+
+
+def _rejected(setup, state, bad):
+    """
+    Return the state without bad detections (E, n).
+
+    Where there are many, it is the star that does not move straight, and
+    what would be left of them is no better than what was rejected.
+    """
+    usable, used = setup.sightings.usable, state.used & ~bad
+    lost = (usable & ~used).sum(axis=0)
+    crooked = bad.any(axis=0) & (lost > FEW) & (
+        lost > MANY * usable.sum(axis=0))
+    return replace(state, used=np.where(crooked, usable, used),
+                   untied=state.untied | crooked,
+                   crooked=state.crooked | crooked)
 
 
 def _inconsistent(setup, problem, estimates):
@@ -227,11 +256,12 @@ def _discrepant(setup, problem, frames):
         return np.empty(0, dtype=int)
     alone = problem.select(stars)
     bound, free = (
-        total_chi2(one, solve(setup, one, frames, residuals=True))
+        solve(setup, one, frames, residuals=True).total
         for one in (alone, alone.unbound))
     rise = bound - free
     limit = chi2_limit(setup.options.clip, alone.ranks)
-    worst = np.nan_to_num(rise / limit, nan=0.0)
+    worst = np.nan_to_num(np.divide(rise, limit, where=limit > 0,
+                                    out=np.zeros_like(rise)), nan=0.0)
     # A few at a time: one bad reference pulls the frame from the others.
     most = max(1, len(stars) // 20)
     chosen = np.argsort(worst)[::-1][:most]
@@ -243,8 +273,10 @@ def _floors(setup, state, problem, frames, *, robust=False):
     stars = np.flatnonzero(problem.ties & setup.anchors
                            & ~np.isin(np.arange(problem.n_stars),
                                       state.dropped))
+    if not len(stars):
+        return state.floor
     estimates = solve(setup, problem.select(stars), frames, residuals=True,
-                       judge=True)
+                      judge=True)
     covariance = setup.sightings.covariance[..., stars]
     used = state.used[:, stars]
     return np.array([floor_variance(
@@ -262,9 +294,9 @@ def worst_outliers(chi2, used, spare, clip):
     """
     Return which detections to reject now, (E, n): each star's worst.
 
-    Only one of a star's goes at a time, because a bad one spoils the
-    residuals of the good; and only where ``spare`` (n,) says the star has
-    detections enough to tell the bad one.
+    Only one of a star's goes at a time, or a twentieth of many, because a
+    bad one spoils the residuals of the good; and only where ``spare`` (n,)
+    says the star has detections enough to tell the bad one.
     """
     limit = chi2_limit(clip, 2)
     chi2 = np.where(used, np.nan_to_num(chi2, nan=0.0), 0.0)
@@ -272,6 +304,12 @@ def worst_outliers(chi2, used, spare, clip):
     out = np.zeros(used.shape, dtype=bool)
     stars = np.arange(used.shape[1])
     out[worst, stars] = (chi2[worst, stars] > limit) & spare
+    most = len(used) // 20
+    if most > 1:
+        # Those about as bad as the worst, which has spoilt the others.
+        rank = chi2.argsort(axis=0)[::-1].argsort(axis=0)
+        out |= ((rank < used.sum(axis=0) // 20) & spare
+                & (chi2 > np.maximum(limit, chi2.max(axis=0) / 4)))
     return out
 
 

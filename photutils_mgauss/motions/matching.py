@@ -375,8 +375,16 @@ def _stack(matches, names, detections):
             np.broadcast_to(year, one.found.shape)
             for year, one in zip(years, detections, strict=True)])
     return Detections(names, take('plane'), take('covariance'), years,
-                      take('flux'), take('found', False),
-                      take('usable', False))
+                      _mean(take('flux')), _mean(take('radial_velocity')),
+                      take('found', False), take('usable', False))
+
+
+def _mean(values):
+    """Return the means (n,) of what is known of stars at E epochs."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    return (np.where(known, values, 0.0).sum(axis=0)
+            / np.where(count, count, np.nan))
 
 
 def _is_by_id(detections, on_sky, how, unit):
@@ -495,10 +503,6 @@ def find_references(catalogue, detections, years, tolerance):
     """
     if catalogue.ids is not None:
         return _lookup(catalogue.ids, detections.ids)
-    if not np.isfinite(catalogue.values[:2]).all(axis=0).any():
-        msg = ("references must have a column 'id' or positions to be found "
-               'among the stars')
-        raise ValueError(msg)
     found = np.full(len(catalogue.kinds), -1)
     for e, year in enumerate(years):
         # Epoch by epoch: frames that differ would blur a star's mean place.

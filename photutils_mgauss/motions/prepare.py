@@ -5,12 +5,12 @@ import astropy.units as u
 import numpy as np
 
 from photutils_mgauss.motions.assemble import Sightings
+from photutils_mgauss.motions.perspective import Nearing
 from photutils_mgauss.motions.priors import (
     Priors,
     add_parallax_prior,
     build_priors,
 )
-from photutils_mgauss.motions.references import perspective
 from photutils_mgauss.sky.transforms import Transform
 
 
@@ -68,7 +68,12 @@ class Setup:
     relative : bool
         Whether there are no references, and all stars are anchors.
     drift : (stars, displacements) or None
-        Known displacements (2, E, k) of k references beyond the model.
+        Displacements (2, E, k) of k references by parallaxes that are known
+        and not fitted.
+    nearing : `~photutils_mgauss.motions.perspective.Nearing`
+        Stars of known radial velocity.
+    notes : tuple of str
+        What could not be used, in sentences.
     typical_variance : float
         Median variance of the detections, 1 if there are none.
     """
@@ -84,6 +89,8 @@ class Setup:
     held: np.ndarray
     relative: bool
     drift: tuple | None
+    nearing: Nearing
+    notes: tuple
     typical_variance: float
 
 
@@ -94,7 +101,11 @@ class State:
 
     ``maps`` (E, 2, b), ``used`` (E, n), ``floor`` (E,) variances per axis,
     ``dropped`` (k,) stars that are references no longer, ``untied`` (n,)
-    stars whose detections disagree too much to find the frames with.
+    stars whose detections disagree too much to find the frames with,
+    ``swerve`` (2, E, k) what stars of known radial velocity move beyond the
+    model, ``crooked`` (n,) stars that no straight motion explains, whose
+    detections are all kept, ``unfinished`` whether there may be outliers
+    left.
     """
 
     maps: np.ndarray
@@ -102,6 +113,9 @@ class State:
     floor: np.ndarray
     dropped: np.ndarray
     untied: np.ndarray
+    swerve: np.ndarray
+    crooked: np.ndarray
+    unfinished: bool = False
 
 
 def prepare(sightings, options):
@@ -120,8 +134,9 @@ def prepare(sightings, options):
     dt = np.nan_to_num(sightings.years - working)
     untied = _scattered(sightings, anchors, options.max_motion)
     _check_references(sightings, anchors, untied, relative, options.transform)
-    origin, transform = _field(sightings, options.transform)
-    drift = _drift(sightings, origin, dt, options)
+    origin, transform = _field(sightings, options.transform, ~untied)
+    drift = _drift(sightings, origin, options)
+    nearing, notes = _nearing(sightings, options)
     use = ~np.isin(stars, held)
     priors = build_priors(catalogue.select(use), stars[use],
                           origin[:, stars[use]], working, sightings.unit,
@@ -132,10 +147,12 @@ def prepare(sightings, options):
     variance = sightings.covariance[0][sightings.usable]
     maps = np.repeat(transform.identity()[None], len(dt), axis=0)
     return (Setup(sightings, options, transform, origin, working, dt, priors,
-                  anchors, held, relative, drift,
+                  anchors, held, relative, drift, nearing, notes,
                   np.median(variance) if variance.size else 1.0),
             State(maps, sightings.usable.copy(), floor,
-                  np.empty(0, dtype=int), untied))
+                  np.empty(0, dtype=int), untied,
+                  np.zeros((2, len(dt), len(nearing.stars))),
+                  np.zeros(len(anchors), dtype=bool)))
 
 
 def _check_parallax(options, sightings):
@@ -209,31 +226,54 @@ def _check_references(sightings, anchors, untied, relative, transform):
         raise ValueError(msg)
 
 
-def _field(sightings, transform):
-    """Return the stars' mean places, and the maps' coordinates for them."""
+def _field(sightings, transform, sound):
+    """
+    Return the stars' mean places, and the maps' coordinates for them.
+
+    The coordinates suit the stars whose places are ``sound`` (n,), if any.
+    """
     count = np.isfinite(sightings.places[0]).sum(axis=0)
     with np.errstate(invalid='ignore'):
         origin = (np.nansum(sightings.places, axis=1)
                   / np.where(count, count, np.nan))
-    transform = transform.fitted_to(origin)
+    inside = np.where(sound | ~sound.any(), origin, np.nan)
+    transform = transform.fitted_to(inside)
     return np.where(np.isfinite(origin), origin,
                     np.reshape(transform.centre, (2, 1))), transform
 
 
-def _drift(sightings, origin, dt, options):
+def _nearing(sightings, options):
     """
-    Return references and their displacements beyond the model, or None.
+    Return the `Nearing` stars, and a sentence on those that are left out.
 
-    Known parallaxes where none are fitted, and perspective acceleration.
+    Without a parallax a radial velocity says nothing about a motion, and
+    the recipe of the paper knows of neither.
     """
+    parallax = np.full(len(sightings.names), np.nan)
+    parallax[sightings.references] = sightings.catalogue.values[4]
+    known = np.isfinite(sightings.radial_velocity)
+    if options.recipe == 'paper' or sightings.unit != 'mas':
+        known[:] = False
+    use = known & (np.isfinite(parallax) | bool(options.parallax))
+    stars, left = np.flatnonzero(use), np.sum(known & ~use)
+    nearing = Nearing(stars, sightings.radial_velocity[stars],
+                      np.nan_to_num(parallax[stars]))
+    if not left:
+        return nearing, ()
+    of = 'one star' if left == 1 else f'{left} stars'
+    note = (f'The radial velocity of {of} is not used, because the parallax '
+            'is not known: give references with parallaxes, or fit them.')
+    return nearing, (note,)
+
+
+def _drift(sightings, origin, options):
+    """Return references and their displacements by known parallaxes."""
     stars, catalogue = sightings.references, sightings.catalogue
-    years = dt if dt.shape[1] == 1 else dt[:, stars]
-    out = perspective(catalogue)[:, None, :] * years**2 / 2
-    if sightings.plane is not None and not options.parallax:
-        observer = sightings.observer
-        if observer.shape[2] > 1:
-            observer = observer[..., stars]
-        parallax = np.nan_to_num(catalogue.values[4])
-        out = out + parallax * sightings.plane.parallax_factors(
-            origin[:, None, stars], observer)
-    return (stars, out) if np.any(out) else None
+    parallax = np.nan_to_num(catalogue.values[4])
+    if sightings.plane is None or options.parallax or not parallax.any():
+        return None
+    observer = sightings.observer
+    if observer.shape[2] > 1:
+        observer = observer[..., stars]
+    return stars, parallax * sightings.plane.parallax_factors(
+        origin[:, None, stars], observer)

@@ -3,7 +3,12 @@ import numpy as np
 
 from photutils_mgauss.motions.joint import cross_covariance
 from photutils_mgauss.motions.problem import CHUNK
-from photutils_mgauss.sky.tangent_plane import directions
+from photutils_mgauss.sky.space_motion import (
+    beyond_straight,
+    jacobian,
+    turned,
+    turns,
+)
 
 FROM_OURS = [0, 1, 4, 2, 3]  # to Gaia's order: position, parallax, motion
 
@@ -33,14 +38,24 @@ def at_epoch(fit, year, stars):
 
     Positions are plane coordinates, no longer relative to an origin.
     """
-    move = _shift_in_time(fit, year)
-    values = move @ fit.estimates.values[:, stars]
-    values[:2] += fit.setup.origin[:, stars]
-    half = np.tensordot(move, fit.estimates.covariance[..., stars], axes=1)
-    return values, np.einsum('ijn,kj->ikn', half, move)
+    values = fit.estimates.values[:, stars]
+    covariance = fit.estimates.covariance[..., stars]
+    move = _straight(fit, year)
+    moved = move @ values
+    half = np.tensordot(move, covariance, axes=1)
+    spread = np.einsum('ijn,kj->ikn', half, move)
+    numbers = np.arange(fit.problem.n_stars)[stars]
+    near = np.flatnonzero(np.isin(numbers, fit.setup.nearing.stars))
+    if near.size:
+        swerve, change = _in_space(fit, year, numbers[near])
+        moved[:len(swerve), near] += swerve
+        half = np.einsum('ijn,jkn->ikn', change, covariance[..., near])
+        spread[..., near] = np.einsum('ijn,kjn->ikn', half, change)
+    moved[:2] += fit.setup.origin[:, stars]
+    return moved, spread
 
 
-def _shift_in_time(fit, year):
+def _straight(fit, year):
     """Return the matrix from parameters at the working epoch to a year."""
     dt = year - fit.setup.working_year
     move = np.eye(fit.problem.n_parameters)
@@ -51,28 +66,22 @@ def _shift_in_time(fit, year):
     return move
 
 
-def turned(plane, values, covariance):
+def _in_space(fit, year, stars):
     """
-    Return values and covariances in local axes instead of the plane's.
+    Return how stars of known radial velocity leave a straight motion.
 
-    The position becomes right ascension and declination [deg], its
-    covariance turns.
+    What is to be added to their first 4 or 5 parameters (size, k), and the
+    matrices (p, p, k) that stand in the place of `_straight`.
     """
-    turn = _turns(plane, values[:2], len(values))
-    moved = np.einsum('ijn,jn->in', turn, values)
-    moved[:2] = directions(plane.deproject(values[:2]))
-    half = np.einsum('ijn,jkn->ikn', turn, covariance)
-    return moved, np.einsum('ijn,kjn->ikn', half, turn)
-
-
-def _turns(plane, places, size):
-    """Return the matrices (p, p, n) from the plane's axes to local ones."""
-    inverse = plane.local_inverse(places)
-    turn = np.zeros((size, size, places.shape[1]))
-    turn[np.arange(size), np.arange(size)] = 1.0
-    for k in [0, 2] + [size - 2] * (size > 5):
-        turn[k:k + 2, k:k + 2] = inverse
-    return turn
+    nearing, dt = fit.setup.nearing, year - fit.setup.working_year
+    size = 5 if fit.setup.options.parallax else 4
+    which = np.searchsorted(nearing.stars, stars)
+    velocity = nearing.velocity[which]
+    values = nearing.values(which, fit.estimates.values[:size, stars],
+                            fit.setup.origin[:, stars])
+    change = np.repeat(_straight(fit, year)[..., None], len(stars), axis=2)
+    change[:size, :size] = jacobian(values, velocity, dt)[:size, :size]
+    return beyond_straight(values, velocity, dt)[:size], change
 
 
 def star_covariance(fit, stars, ref_year):
@@ -80,11 +89,15 @@ def star_covariance(fit, stars, ref_year):
     problem = fit.problem.select(stars)
     covariance = cross_covariance(problem, fit.frames.factor)
     size = problem.n_parameters
-    change = np.repeat(_shift_in_time(fit, ref_year)[None], len(stars), 0)
+    change = np.repeat(_straight(fit, ref_year)[None], len(stars), 0)
+    near = np.flatnonzero(np.isin(stars, fit.setup.nearing.stars))
+    if near.size:
+        change[near] = _in_space(fit, ref_year, stars[near])[1].transpose(
+            2, 0, 1)
     plane = fit.setup.sightings.plane
     if plane is not None:
         places = at_epoch(fit, ref_year, stars)[0][:2]
-        change = _turns(plane, places, size).transpose(2, 0, 1) @ change
+        change = turns(plane, places, size).transpose(2, 0, 1) @ change
     covariance = np.einsum('kij,kjlm,lnm->kiln', change, covariance, change)
     order = [k for k in FROM_OURS if k < size] if (
         fit.setup.options.parallax) else [0, 1, 2, 3]

@@ -10,19 +10,21 @@ from dataclasses import dataclass, replace
 import astropy.units as u
 import numpy as np
 
-from photutils_mgauss.motions.epoch import find_column, numbers
+from photutils_mgauss.motions.epoch import (
+    names_of,
+    numbers,
+    table_vectors,
+)
 from photutils_mgauss.motions.stacked import apply
 from photutils_mgauss.sky.observers import julian_years
-from photutils_mgauss.sky.tangent_plane import unit_vectors
+from photutils_mgauss.sky.space_motion import carried
+from photutils_mgauss.utils.star_columns import find_column
 
 CLASSES = ('qso', 'galaxy', 'star', 'position')
 FIXED = ('qso', 'galaxy')  # neither move nor have a parallax
 GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
 UNKNOWN = 1e30  # variance of what is not known
 ORDER = [0, 1, 3, 4, 2]  # Gaia's order to ours: position, motion, parallax
-# mas/yr^2 of perspective acceleration for unit motion [mas/yr], parallax
-# [mas] and radial velocity [km/s]: -2 / (4.74047 km/s * 206264806 mas).
-PERSPECTIVE = -2 / (4.740470446 * 206264806.24709636)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +34,8 @@ class Catalogue:
 
     ``values`` (5, k) and ``covariance`` (5, 5, k) are position, motion and
     parallax on the plane [unit, unit/yr], at Julian years ``year`` (k,).
+    ``rows`` (k,) are those of the user's table, -1 without one, and
+    ``source_ids`` (k,) what it calls the objects, if it does.
     """
 
     ids: np.ndarray | None
@@ -40,6 +44,8 @@ class Catalogue:
     covariance: np.ndarray
     year: np.ndarray
     radial_velocity: np.ndarray
+    rows: np.ndarray
+    source_ids: np.ndarray | None
 
     def motion(self):
         """Return motions (2, k) as far as they are known."""
@@ -52,13 +58,28 @@ class Catalogue:
         """Which objects neither move nor have a parallax, (k,)."""
         return np.isin(self.kinds, FIXED)
 
+    def at(self, year):
+        """
+        Return the objects with all motions in space carried to a year.
+
+        Only stars of known motion, parallax and radial velocity do not move
+        along straight lines; all others stay as they are.
+        """
+        values, covariance, years = carried(
+            self.values, self.covariance, self.radial_velocity, self.year,
+            year)
+        return replace(self, values=values, covariance=covariance, year=years)
+
     def select(self, which):
         """Return some of the objects, without their identifiers."""
         return replace(
             self, ids=None, kinds=self.kinds[which],
             values=self.values[:, which],
             covariance=self.covariance[..., which], year=self.year[which],
-            radial_velocity=self.radial_velocity[which])
+            radial_velocity=self.radial_velocity[which],
+            rows=self.rows[which],
+            source_ids=(None if self.source_ids is None
+                        else self.source_ids[which]))
 
 
 def quasars(n):
@@ -66,52 +87,50 @@ def quasars(n):
     nothing = np.full(n, np.nan)
     return Catalogue(None, np.full(n, 'qso'), np.full((5, n), np.nan),
                      np.repeat(UNKNOWN * np.eye(5)[..., None], n, axis=2),
-                     nothing, nothing)
+                     nothing, nothing, np.full(n, -1), None)
 
 
 def read_catalogue(table, plane, unit):
     """Return the `Catalogue` of a table of references."""
     n = len(table)
+    _check_findable(table, plane)
     kinds = _kinds(table)
     years = _years(table, kinds)
     values = np.full((5, n), np.nan)
     per_year = _unit(unit) / u.yr
     for k, name in ((2, 'pmra'), (3, 'pmdec')):
-        values[k] = _numbers(table, name, per_year)
-    values[4] = _numbers(table, 'parallax', _unit(unit))
+        values[k] = numbers(table, name, per_year)
+    values[4] = numbers(table, 'parallax', _unit(unit))
     _check_motions(kinds, values)
-    velocity = _numbers(table, 'radial_velocity', u.km / u.s)
+    velocity = numbers(table, 'radial_velocity', u.km / u.s)
     ids = np.asarray(table['id']) if 'id' in table.colnames else None
     covariance = _covariance(table, unit)
     values[:2] = _positions(table, plane, unit)
     if plane is not None and np.isfinite(values[:2]).any():
         turn = np.zeros((5, 5, n))
-        turn[:2, :2] = turn[2:4, 2:4] = plane.local_jacobian(values[:2])
+        local = plane.local_jacobian(values[:2])
+        # A star of unknown place keeps its motion.
+        turn[:2, :2] = turn[2:4, 2:4] = np.where(
+            np.isfinite(local), local, np.eye(2)[..., None])
         turn[4, 4] = 1
         values[2:4] = apply(turn[2:4, 2:4], values[2:4])
         covariance = np.einsum('ijn,jkn,lkn->iln', turn, covariance, turn)
-    return Catalogue(ids, kinds, values, covariance, years, velocity)
+    names = (np.asarray(table['source_id'])
+             if 'source_id' in table.colnames else None)
+    return Catalogue(ids, kinds, values, covariance, years, velocity,
+                     np.arange(n), names)
+
+
+def _check_findable(table, plane):
+    x = ('ra',) if plane is not None else names_of('x')
+    if 'id' not in table.colnames and find_column(table, x) is None:
+        msg = ("references must have a column 'id' or positions to be found "
+               'among the stars')
+        raise ValueError(msg)
 
 
 def _unit(unit):
     return u.Unit('pix' if unit == 'pix' else 'mas')
-
-
-def _numbers(table, name, unit):
-    """Return a column as floats in ``unit``, NaN if there is none."""
-    if name not in table.colnames:
-        return np.full(len(table), np.nan)
-    column = table[name]
-    has = getattr(column, 'unit', None)
-    if has is None or has == '':
-        return np.ma.filled(np.ma.asarray(column, dtype=float), np.nan)
-    try:
-        return np.array(u.Quantity(
-            np.ma.filled(column, np.nan), has).to_value(unit), dtype=float)
-    except u.UnitConversionError as error:
-        msg = (f'column {name!r} of references must have a unit like '
-               f'{unit}, got {has}')
-        raise ValueError(msg) from error
 
 
 def _kinds(table):
@@ -124,25 +143,13 @@ def _kinds(table):
                    f'got {kinds[bad][0]!r}')
             raise ValueError(msg)
         return kinds
-    if 'pmra' not in table.colnames or 'pmdec' not in table.colnames:
-        return np.full(len(table), 'position')
-    known = np.isfinite(_raw(table['pmra']) + _raw(table['pmdec']))
+    known = np.isfinite(numbers(table, 'pmra') + numbers(table, 'pmdec'))
     return np.where(known, 'star', 'position')
-
-
-def _raw(column):
-    values = getattr(column, 'value', column)
-    return np.ma.filled(np.ma.asarray(values, dtype=float), np.nan)
 
 
 def _positions(table, plane, unit):
     if plane is not None:
-        if find_column(table, 'ra') is None:
-            return np.full((2, len(table)), np.nan)
-        return plane.project(unit_vectors(numbers(table, 'ra', u.deg),
-                                          numbers(table, 'dec', u.deg)))
-    if find_column(table, 'x') is None:
-        return np.full((2, len(table)), np.nan)
+        return plane.project(table_vectors(table))
     return np.stack([numbers(table, key, _unit(unit)) for key in 'xy'])
 
 
@@ -150,19 +157,19 @@ def _covariance(table, unit):
     """Return (5, 5, k) in our order; NaN rows where there is no error."""
     angle = _unit(unit)
     units = (angle, angle, angle, angle / u.yr, angle / u.yr)
+    first = ('ra_err', 'dec_err')
+    if find_column(table, names_of('ra_err')) is None:
+        first = ('x_err', 'y_err')
+    keys = (*first, *(f'{name}_error' for name in GAIA[2:]))
     errors = []
-    for name, one in zip(GAIA, units, strict=True):
-        column = f'{name}_error'
-        if column not in table.colnames and name in ('ra', 'dec'):
-            column = {'ra': 'x_error', 'dec': 'y_error'}[name]
-        error = _numbers(table, column, one)
+    for key, one in zip(keys, units, strict=True):
+        error = numbers(table, key, one)
         errors.append(np.where(error > 0, error, np.nan))
     out = np.empty((5, 5, len(table)))
     for i, a in enumerate(GAIA):
         for j, b in enumerate(GAIA):
             name = f'{a}_{b}_corr' if i < j else f'{b}_{a}_corr'
-            rho = 1.0 if i == j else np.nan_to_num(
-                _numbers(table, name, None))
+            rho = 1.0 if i == j else np.nan_to_num(numbers(table, name))
             out[i, j] = rho * errors[i] * errors[j]
     return _without_nan(out)[ORDER][:, ORDER]
 
@@ -195,10 +202,3 @@ def _check_motions(kinds, values):
                f"none in row {np.flatnonzero(bad)[0]}; class 'position' is "
                'for stars of unknown motion')
         raise ValueError(msg)
-
-
-def perspective(catalogue):
-    """Return known perspective accelerations (2, k) [unit/yr^2], 0 else."""
-    rate = (PERSPECTIVE * catalogue.values[4] * catalogue.radial_velocity
-            * catalogue.values[2:4])
-    return np.nan_to_num(rate)

@@ -1,13 +1,16 @@
 """What a fit of proper motions found: motions, frames, and their errors."""
+import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
+from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss.motions.bootstrap import bootstrap_frames
-from photutils_mgauss.motions.corrected_wcs import correct_epochs
+from photutils_mgauss.motions.corrected_epochs import correct_epochs
+from photutils_mgauss.motions.doubts import doubts, remarks
 from photutils_mgauss.motions.loop import Fit, measured_alone
 from photutils_mgauss.motions.propagation import (
     propagated,
@@ -57,10 +60,14 @@ def solution_of(result, ref_epoch=None):
     year = result.setup.working_year if ref_epoch is None else ref_epoch
     parameters = propagated(result, year)
     corrected, residuals = correct_epochs(result)
-    return MotionSolution(
-        star_table(result, year, parameters), corrected,
-        alignment_table(result, residuals),
-        result.frames.undetermined + result.setup.sightings.notes, result)
+    stars = star_table(result, year, parameters)
+    alignment = alignment_table(result, residuals)
+    doubtful = doubts(result)
+    for sentence in doubtful:
+        warnings.warn(sentence, AstropyUserWarning, stacklevel=3)
+    notes = (*doubtful, *remarks(result), *result.frames.undetermined,
+             *result.setup.notes, *result.setup.sightings.notes)
+    return MotionSolution(stars, corrected, alignment, notes, result)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +92,10 @@ class MotionSolution:
         the references used and rejected, the rms of their residuals, and
         the systematic error found.
     notes : tuple of str
-        What the data could not determine, and which epochs have few stars
-        in common with the others, in sentences.
+        What speaks against the references (each of these is a warning
+        of the fit, too) or the errors, what the data could not determine
+        and the fit did not use, and which epochs have few stars in common
+        with the others, in sentences.
 
     Examples
     --------

@@ -1,13 +1,14 @@
 """The tables of a solution, with the Gaia catalogue's column names."""
 import astropy.units as u
 import numpy as np
-from astropy.table import QTable
+from astropy.table import MaskedColumn, QTable
 
 from photutils_mgauss.motions.joint import solve_all
 from photutils_mgauss.motions.loop import measured
 from photutils_mgauss.motions.propagation import FROM_OURS
 from photutils_mgauss.motions.stacked import invert_2x2
 from photutils_mgauss.sky.tangent_plane import directions
+from photutils_mgauss.utils.star_columns import words_column
 
 # What each bit of a star's flags means.
 FLAGS = {
@@ -57,7 +58,8 @@ def validation_table(fit, stars):
     """Return held-out references beside their catalogue values."""
     sightings, held = fit.setup.sightings, fit.setup.held
     unit = u.Unit(sightings.unit) / u.yr
-    motion, covariance = _catalogue_motions(sightings, held)
+    year = float(stars['ref_epoch'][0].value)
+    motion, covariance = _catalogue_motions(sightings, held, year)
     rows = stars[held]
     table = QTable({'id': rows['id']})
     away, errors = [], []
@@ -76,10 +78,12 @@ def validation_table(fit, stars):
     return table
 
 
-def _catalogue_motions(sightings, stars):
+def _catalogue_motions(sightings, stars, year):
     """Return catalogue motions (2, k) and covariances in local axes."""
     place = {star: k for k, star in enumerate(sightings.references)}
     catalogue = sightings.catalogue.select([place[star] for star in stars])
+    if sightings.unit == 'mas':
+        catalogue = catalogue.at(year)
     motion = catalogue.motion()
     covariance = catalogue.covariance[2:4, 2:4] * ~catalogue.fixed
     if sightings.plane is not None:
@@ -105,8 +109,11 @@ def star_table(fit, ref_year, parameters):
     _add_quality(table, fit, solved)
     if fit.leak is not None:
         flags |= _add_leak(table, fit.leak, solved)
-    table['flux'] = _mean_flux(sightings.flux)
+    table['flux'] = sightings.flux
+    if np.isfinite(sightings.radial_velocity).any():
+        table['radial_velocity'] = sightings.radial_velocity * u.km / u.s
     table['reference'] = _reference_kinds(fit)
+    _add_references(table, sightings)
     table['flags'] = flags
     table.meta['TIMESYS'] = 'TDB'
     return table
@@ -207,19 +214,27 @@ def _add_leak(table, leak, solved):
     return 128 * (np.nan_to_num(strongest) > STRONG).astype(int)
 
 
-def _mean_flux(flux):
-    count = np.isfinite(flux).sum(axis=0)
-    with np.errstate(invalid='ignore'):
-        return np.nansum(flux, axis=0) / np.where(count, count, np.nan)
-
-
 def _reference_kinds(fit):
     sightings, setup = fit.setup.sightings, fit.setup
     out = np.full(len(sightings.names), '', dtype='U8')
     out[sightings.references] = sightings.catalogue.kinds
     out[setup.held] = ''
     out[fit.state.dropped] = ''
-    return out
+    return words_column(out)
+
+
+def _add_references(table, sightings):
+    """Add where each reference object is in the table of references."""
+    stars, catalogue = sightings.references, sightings.catalogue
+    if (catalogue.rows < 0).any() or not len(stars):
+        return
+    rows = np.full(len(table), -1)
+    rows[stars] = catalogue.rows
+    table['reference_row'] = rows
+    if catalogue.source_ids is not None:
+        names = np.zeros(len(table), dtype=catalogue.source_ids.dtype)
+        names[stars] = catalogue.source_ids
+        table['source_id'] = MaskedColumn(names, mask=rows < 0)
 
 
 def alignment_table(fit, wcs_residuals):

@@ -3,9 +3,10 @@ The sky as planes, maps and observers; it knows no star.
 
 `tangent_plane` has unit vectors and the plane that touches the sky, `wcs`
 goes from pixels to the sky and back through any WCS, `transforms` maps one
-plane onto another, from shifts to polynomials, `correction` is what such a
-map does to directions, and `observers` has times, places of observers and
-aberration. Angles and times enter as astropy's
+plane onto another, from shifts to polynomials, `common_points` finds one
+from objects on both planes, `correction` is what such a map does to
+directions, `corrected_wcs` puts it into a WCS, and `observers` has times,
+places of observers and aberration. Angles and times enter as astropy's
 Quantity, Time and SkyCoord and leave as plain radians, years and unit
 vectors, of which all that the room `motions` does is made.
 """

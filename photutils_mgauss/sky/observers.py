@@ -30,8 +30,10 @@ def julian_years(time, name='time'):
     Return times as Julian years in TDB.
 
     Plain numbers are taken to be Julian years already (not decimal years:
-    the two differ by up to 0.4 days, and their rates by 2e-4).
+    the two differ by up to 0.4 days, and their rates by 2e-4). Words are
+    dates in UTC, such as '2013-05-01T12:00:00'.
     """
+    time = _read_dates(time)
     if isinstance(time, Time):
         with warnings.catch_warnings():
             # UTC after the last announced leap second is uncertain by a
@@ -41,6 +43,21 @@ def julian_years(time, name='time'):
     else:
         years = _plain_years(time, name)
     return np.asarray(years, dtype=float)
+
+
+def _read_dates(time):
+    """Return the Time of words that are dates; leave all else alone."""
+    if np.asarray(time).dtype.kind not in 'US':
+        return time
+    words = np.asarray(time).astype(str)
+    try:
+        return words.astype(float)
+    except ValueError:
+        pass
+    try:
+        return Time(words, scale='utc')
+    except ValueError:
+        return time
 
 
 def _plain_years(time, name):
@@ -53,6 +70,7 @@ def _plain_years(time, name):
     except (TypeError, ValueError) as error:
         msg = f'{name} must be a Time or Julian years, got {time!r:.80}'
         raise TypeError(msg) from error
+    years = np.where(np.isfinite(years), years, np.nan)
     if (np.abs(years) > MAX_YEAR).any():
         worst = years[np.abs(years) > MAX_YEAR][0] if years.ndim else years
         msg = (f'{name} must be a Time or Julian years below {MAX_YEAR}, got '

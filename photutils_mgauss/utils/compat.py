@@ -6,6 +6,7 @@ When photutils >= 3.1 is the oldest supported, this file can go.
 from copy import copy, deepcopy
 from weakref import WeakValueDictionary
 
+import numpy as np
 import photutils
 from astropy.utils import minversion
 from photutils.psf import PSFPhotometry
@@ -70,8 +71,19 @@ def prepare_inputs(photometry, data, mask, error, init_params):
     data, mask, error, init_params : tuple
         Without units; all None if no stars were found.
     """
-    return photometry._prepare_fit_inputs(data, mask=mask, error=error,
-                                          init_params=init_params)
+    names = None
+    if init_params is not None and 'id' in init_params.colnames:
+        names = np.asarray(init_params['id'])
+    if names is None or names.dtype.kind not in 'USO':
+        return photometry._prepare_fit_inputs(data, mask=mask, error=error,
+                                              init_params=init_params)
+    # photutils makes groups of the identifiers, and groups are numbers.
+    numbered = init_params.copy()
+    numbered['id'] = np.arange(1, len(names) + 1)
+    data, mask, error, prepared = photometry._prepare_fit_inputs(
+        data, mask=mask, error=error, init_params=numbered)
+    prepared['id'] = names[np.asarray(prepared['id']) - 1]
+    return data, mask, error, prepared
 
 
 def check_nddata(mask, error):

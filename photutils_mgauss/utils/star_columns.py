@@ -3,7 +3,7 @@ from dataclasses import dataclass
 
 import astropy.units as u
 import numpy as np
-from astropy.table import Table
+from astropy.table import MaskedColumn, Table
 
 # What may stand behind x, y and flux in the names of columns, in order of
 # preference.
@@ -50,15 +50,8 @@ def read_sources(table, name='stars', *, first='', unit=None):
                f'likes, got {table.colnames}')
         raise ValueError(msg)
     x, y = (column_values(table, f'{axis}{end}', u.pix) for axis in 'xy')
-    return Sources(x, y, _fluxes(table, name, endings, unit),
-                   _selected(table))
-
-
-def _fluxes(table, name, endings, unit):
-    column = find_column(table, [f'flux{e}' for e in endings])
-    if column is None:
-        return np.full(len(table), np.nan)
-    return column_values(table, column, unit)
+    flux = first_values(table, [f'flux{e}' for e in endings], unit)
+    return Sources(x, y, flux, _selected(table))
 
 
 def _selected(table):
@@ -67,9 +60,29 @@ def _selected(table):
     return np.asarray(np.ma.filled(table['selected'], False), bool)
 
 
+def words_column(words):
+    """
+    Return a column of words, empty ones included, none of them masked.
+
+    ECSV takes the empty words of other columns for missing ones when they
+    are read again.
+    """
+    column = MaskedColumn(words)
+    column.info.serialize_method['ecsv'] = 'data_mask'
+    return column
+
+
 def find_column(table, names):
     """Return the first of some names that a table has, or None."""
     return next((name for name in names if name in table.colnames), None)
+
+
+def first_values(table, names, unit=None):
+    """Return the first of some columns as floats, NaN if there is none."""
+    name = find_column(table, names)
+    if name is None:
+        return np.full(len(table), np.nan)
+    return column_values(table, name, unit)
 
 
 def column_values(table, name, unit=None):

@@ -101,3 +101,11 @@ def test_a_catalogue_keeps_its_positions_and_may_hold_nonsense(data):
 def test_an_empty_image_is_an_error(rng):
     with pytest.raises(ValueError, match='at least 1 source'):
         select_psf_stars(rng.normal(0, 1, (60, 60)), threshold=50)
+
+
+def test_selected_stars_have_no_reason_after_a_file_too(data, tmp_path):
+    table = select_psf_stars(data)
+    table.write(tmp_path / 'stars.ecsv')
+    again = Table.read(tmp_path / 'stars.ecsv')
+    assert list(again['reason']) == list(table['reason'])
+    assert (again['reason'] == '').sum() == table['selected'].sum() > 0

@@ -152,3 +152,17 @@ def test_an_epoch_says_what_is_wrong_with_it(make, error, words):
 def test_duplicate_identifiers_are_an_error():
     with pytest.raises(ValueError, match="'id' must hold unique values"):
         read_epoch(Epoch(table(id=[3, 3]), time=2020.0))
+
+
+@pytest.mark.parametrize('date', ['2013-05-01', '2013-05-01T00:00:00',
+                                  np.str_('2013-05-01')])
+def test_dates_may_be_words(date):
+    expected = Time('2013-05-01', scale='utc').tdb.jyear
+    assert Epoch(table(), tan_wcs(0, 0), date).mean_year == expected
+    rows = table()
+    rows['time'] = np.full(len(rows), str(date))
+    assert_allclose(Epoch(rows, tan_wcs(0, 0)).years, expected)
+
+
+def test_years_may_be_words():
+    assert Epoch(table(), time='2013.5').mean_year == 2013.5

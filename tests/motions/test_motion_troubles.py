@@ -12,6 +12,7 @@ from helpers.motion_scenes import (
     plane_epochs,
     rms,
 )
+from helpers.wcs import tan_wcs
 from photutils_mgauss import Epoch, ProperMotionFitter, decode_motion_flags
 
 
@@ -205,3 +206,129 @@ def test_epochs_in_pixels_take_a_radius_and_systematic_errors_in_pixels(rng):
         systematic=0.001 * u.pix).fit(epochs).stars
     assert len(stars) == motion.shape[1]
     assert str(stars['pmra'].unit) == 'pix / yr'
+
+
+def sky_epochs(rng, kind, n=60):
+    """Return epochs with a WCS, or with ra and dec, that have all columns."""
+    wcs = tan_wcs(150, 2)
+    place, motion = rng.uniform(0, 1000, (2, n)), rng.normal(0, 0.01, (2, n))
+    motion[:, 20:40] = 0
+    epochs = []
+    for year in (2020.0, 2021.0, 2022.5):
+        x, y = place + motion * (year - 2020) + rng.normal(0, 0.01, (2, n))
+        table = Table({'id': np.arange(n), 'flux_fit': np.ones(n),
+                       'time': np.full(n, year)})
+        if kind == 'pixels':
+            table['x_fit'], table['y_fit'] = x, y
+            table['x_err'] = table['y_err'] = 0.01
+            table['xy_cov'] = 0.0
+        else:
+            table['ra'], table['dec'] = wcs.all_pix2world(x, y, 0)
+            table['ra_error'] = table['dec_error'] = 0.7
+        epochs.append(Epoch(table, wcs if kind == 'pixels' else None))
+    return epochs
+
+
+@pytest.mark.parametrize(('kind', 'column'), [
+    ('pixels', 'x_fit'), ('pixels', 'y_err'), ('pixels', 'xy_cov'),
+    ('pixels', 'time'), ('pixels', 'flux_fit'), ('sky', 'ra'),
+    ('sky', 'dec'), ('sky', 'ra_error'), ('sky', 'time')])
+@pytest.mark.parametrize('value', [np.inf, -np.inf, np.nan])
+def test_one_bad_number_costs_its_own_detection(rng, kind, column, value):
+    epochs = sky_epochs(rng, kind)
+    damaged, without = (changed(epochs[1]) for _ in range(2))
+    damaged.table[column][3] = value
+    if column != 'flux_fit':
+        without.table.remove_row(3)
+    fitter = ProperMotionFitter(references=list(range(20, 40)))
+    got, expected = (fitter.fit([epochs[0], one, epochs[2]]).stars
+                     for one in (damaged, without))
+    for table in (got, expected):
+        table.sort('id')
+    for name in ('ra', 'dec', 'pmra', 'pmdec', 'pmra_error', 'flux'):
+        assert np.isfinite(got[name]).all()
+        assert_allclose(got[name].value if got[name].unit else got[name],
+                        expected[name].value if expected[name].unit
+                        else expected[name], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(('kind', 'column', 'value'), [
+    ('pixels', 'x_fit', 1e20), ('sky', 'dec', 1e6), ('sky', 'ra', 1e20)])
+def test_a_wild_place_leaves_the_others_alone(rng, kind, column, value):
+    epochs = sky_epochs(rng, kind)
+    damaged = changed(epochs[1])
+    damaged.table[column][3] = value
+    fitter = ProperMotionFitter(references=list(range(20, 40)))
+    clean, got = (fitter.fit([epochs[0], one, epochs[2]])
+                  for one in (epochs[1], damaged))
+    others = clean.stars['id'] != 3
+    # It was one of sixty that tied the frames.
+    assert_allclose(got.stars['pmra'][others].value,
+                    clean.stars['pmra'][others].value, atol=0.02)
+    assert got.stars['flags'][3] & (4 | 512)
+    assert not got.alignment['wcs_residual'].value.max() > 1e-4
+
+
+def test_a_wild_place_on_a_plane_leaves_the_others_alone(rng):
+    epochs, motion = plane_epochs(rng, 60)
+    epochs[1].table['x_fit'][3] = 1e20
+    got = ProperMotionFitter().fit(epochs).stars
+    away = np.delete(got['pmra'].value - motion[0], 3)
+    assert_allclose(away - np.median(away), 0, atol=0.04)
+
+
+def test_a_reference_of_unknown_place_keeps_its_motion(rng):
+    epochs = sky_epochs(rng, 'sky')
+    table = epochs[0].table
+    references = Table({
+        'id': np.arange(20, 40), 'ra': table['ra'][20:40],
+        'dec': table['dec'][20:40], 'pmra': np.full(20, 3.0),
+        'pmdec': np.full(20, -2.0), 'ref_epoch': np.full(20, 2020.0)})
+    for name in ('ra', 'dec', 'pmra', 'pmdec'):
+        references[f'{name}_error'] = 0.01
+    references['ra'][0] = np.inf
+    references['parallax'] = np.where(np.arange(20) == 1, np.inf, 0.1)
+    references['parallax_error'] = np.where(np.arange(20) == 2, np.inf, 0.1)
+    stars = ProperMotionFitter(references=references, clip=None,
+                               systematic=None).fit(epochs).stars
+    assert np.isfinite(stars['pmra']).all()
+    assert_allclose(stars['pmra'][20:23].value, 3.0, atol=0.05)
+
+
+def scans(rng, *, orbit=0.0, wild=0, n=300, error=0.1):
+    """Return many epochs of a star that moves by 3 mas/yr, and circles."""
+    years = 2014 + np.sort(rng.uniform(0, 5, n))
+    phase = 2 * np.pi * years / 11.6
+    east = 3 * (years - 2017) + orbit * np.cos(phase) + rng.normal(
+        0, error, n)
+    north = 0.6 * orbit * np.sin(phase) + rng.normal(0, error, n)
+    east[rng.choice(n, wild, replace=False)] += rng.normal(0, 1000, wild)
+    return [Epoch(Table({
+        'id': [1], 'ra': [294.8 + x / 3.6e6 / np.cos(np.radians(14.9))],
+        'dec': [14.9 + y / 3.6e6], 'ra_error': [error],
+        'dec_error': [error]}), time=year)
+        for year, x, y in zip(years, east, north, strict=True)]
+
+
+@pytest.mark.parametrize('orbit', [3.0, 25.0])
+def test_a_binary_keeps_its_detections_and_is_flagged(rng, orbit):
+    epochs = scans(rng, orbit=orbit)
+    fits = {clip: ProperMotionFitter(transform=None, clip=clip,
+                                     match_by='id').fit(epochs)
+            for clip in (None, 5.0)}
+    star, plain = (fits[clip].stars[0] for clip in (5.0, None))
+    assert [words.split(':')[0] for words in decode_motion_flags(
+        star['flags'])] == ['inconsistent']
+    assert star['n_good_obs'] == 300
+    assert star['pmra'] == plain['pmra']
+    assert any('one straight motion' in note for note in fits[5.0].notes)
+
+
+@pytest.mark.parametrize('wild', [1, 5, 60])
+def test_many_wild_detections_of_one_star_are_rejected(rng, wild):
+    star = ProperMotionFitter(transform=None, match_by='id').fit(
+        scans(rng, wild=wild)).stars[0]
+    # A few of the wild ones lie within five standard errors.
+    assert 300 - wild <= star['n_good_obs'] <= 300 - 0.9 * wild
+    assert abs(star['pmra'].value - 3) < 5 * star['pmra_error'].value
+    assert star['uwe'] < 1.2

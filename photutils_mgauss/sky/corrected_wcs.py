@@ -1,12 +1,12 @@
 """
-WCS that contain the map found for their epoch.
+WCS that contain a correction of the directions they give.
 
 A gwcs gets one more step after the sky: onto the common tangent plane, the
 map, and back. Anything else becomes a FITS header, TAN with a SIP polynomial
 fitted to the corrected positions. The WCS given is never touched.
 """
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gwcs
 import numpy as np
@@ -14,9 +14,7 @@ from astropy.coordinates import ICRS, SkyCoord
 from astropy.io.fits import Header
 from astropy.wcs import WCS
 
-from photutils_mgauss.motions.epoch import numbers, pixel_size
-from photutils_mgauss.sky.correction import DEGREE, Correction, sky_model
-from photutils_mgauss.sky.observers import observer_velocity
+from photutils_mgauss.sky.correction import DEGREE, sky_model
 from photutils_mgauss.sky.tangent_plane import TangentPlane, directions
 from photutils_mgauss.sky.transforms import exponents, monomials
 from photutils_mgauss.sky.wcs import celestial_frame, pixel_to_vectors
@@ -60,6 +58,30 @@ class Region:
     def middle(self):
         """The middle pixel."""
         return sum(self.x) / 2, sum(self.y) / 2
+
+
+def corrected_wcs(wcs, correction, region, pixel_map=None):
+    """
+    Return a WCS that gives corrected directions, and its residual [mas].
+
+    Parameters
+    ----------
+    wcs : APE 14 WCS or None
+    correction : `~photutils_mgauss.sky.correction.Correction`
+    region : `Region`
+        The pixels it is for.
+    pixel_map : (2, 3) `~numpy.ndarray`, optional
+        Without a WCS: the map of pixels onto the plane of the correction.
+    """
+    if isinstance(wcs, gwcs.WCS):
+        return corrected_gwcs(wcs, correction, region)
+
+    def directions_of(x, y):
+        if wcs is not None:
+            return correction(pixel_to_vectors(wcs, x, y, bounded=False))
+        return correction(correction.plane.deproject(
+            pixel_map[:, :1] + pixel_map[:, 1:] @ np.stack([x, y])))
+    return corrected_header(wcs, directions_of, region)
 
 
 def corrected_gwcs(wcs, correction, region):
@@ -238,60 +260,3 @@ def _frame_cards(wcs, frame):
 def _header_residual(wcs, function, region):
     x, y = region.grid(2 * GRID)
     return _largest_angle(pixel_to_vectors(wcs, x, y), function(x, y))
-
-
-def correct_epochs(result):
-    """
-    Return epochs with corrected WCS, and the residuals of those [mas].
-
-    Epochs without a place in the sky, and all if no maps were fitted, stay
-    as they are and have NaN as residual. ``result`` is the `Fit`.
-    """
-    sightings, transform = result.setup.sightings, result.setup.transform
-    if sightings.plane is None or transform.kind == 'none':
-        return list(sightings.epochs), [np.nan] * len(sightings.epochs)
-    pairs = [correct_epoch(
-        epoch, Correction(sightings.plane, transform, coefficients,
-                          observer_velocity(epoch.observer)), tie)
-             for epoch, coefficients, tie in zip(
-                 sightings.epochs, result.state.maps, sightings.ties.maps,
-                 strict=True)]
-    return tuple(list(some) for some in zip(*pairs, strict=True))
-
-
-def correct_epoch(epoch, correction, tie):
-    """
-    Return an epoch with a corrected WCS, and the WCS's residual [mas].
-
-    ``tie`` is the map (2, 3) of an epoch without WCS onto the common plane,
-    or None. Epochs without pixels stay as they are.
-    """
-    pixels = _stars_pixels(epoch)
-    if isinstance(epoch.wcs, gwcs.WCS):
-        region = Region.of(epoch.wcs, *pixels)
-        wcs, residual = corrected_gwcs(epoch.wcs, correction, region)
-        return epoch.with_wcs(wcs), residual
-    directions_of = _pixel_directions(epoch, correction, tie)
-    if directions_of is None:
-        return epoch, np.nan
-    wcs, residual = corrected_header(epoch.wcs, directions_of,
-                                     Region.of(epoch.wcs, *pixels))
-    return replace(epoch, wcs=wcs, pixel_scale=None), residual
-
-
-def _stars_pixels(epoch):
-    if not epoch.is_pixels:
-        return np.array([0.0]), np.array([0.0])
-    return tuple(numbers(epoch.table, key) for key in 'xy')
-
-
-def _pixel_directions(epoch, correction, tie):
-    """Return the function from pixels to corrected directions, or None."""
-    if epoch.wcs is not None:
-        return lambda x, y: correction(
-            pixel_to_vectors(epoch.wcs, x, y, bounded=False))
-    if tie is None or pixel_size(epoch) is None:
-        return None
-    slope = tie[:, 1:] * pixel_size(epoch)
-    return lambda x, y: correction(correction.plane.deproject(
-        tie[:, :1] + slope @ np.stack([x, y])))

@@ -1,0 +1,56 @@
+"""Epochs whose WCS contain the maps that were found for them."""
+from dataclasses import replace
+
+import numpy as np
+
+from photutils_mgauss.motions.epoch import numbers
+from photutils_mgauss.sky.corrected_wcs import Region, corrected_wcs
+from photutils_mgauss.sky.correction import Correction
+from photutils_mgauss.sky.observers import observer_velocity
+
+
+def correct_epochs(result):
+    """
+    Return epochs with corrected WCS, and the residuals of those [mas].
+
+    Epochs without a place in the sky, and all if no maps were fitted, stay
+    as they are and have NaN as residual. ``result`` is the `Fit`.
+    """
+    sightings, transform = result.setup.sightings, result.setup.transform
+    if sightings.plane is None or transform.kind == 'none':
+        return list(sightings.epochs), [np.nan] * len(sightings.epochs)
+    # A wild place, which the fit left out, is no part of the image.
+    sound = result.state.used & ~result.state.untied
+    pairs = [correct_epoch(
+        epoch, Correction(sightings.plane, transform, coefficients,
+                          observer_velocity(epoch.observer)), tie,
+        rows[inside])
+             for epoch, coefficients, tie, rows, inside in zip(
+                 sightings.epochs, result.state.maps, sightings.ties.maps,
+                 sightings.matches.rows, sound, strict=True)]
+    return tuple(list(some) for some in zip(*pairs, strict=True))
+
+
+def correct_epoch(epoch, correction, tie, rows):
+    """
+    Return an epoch with a corrected WCS, and the WCS's residual [mas].
+
+    ``tie`` is the map (2, 3) of an epoch without WCS onto the common plane,
+    or None, and ``rows`` (k,) are the rows of its table that were used.
+    Epochs without pixels stay as they are.
+    """
+    if epoch.wcs is None and (tie is None or epoch.pixel_size is None):
+        return epoch, np.nan
+    pixel_map = None
+    if epoch.wcs is None:
+        pixel_map = np.column_stack([tie[:, 0],
+                                     tie[:, 1:] * epoch.pixel_size])
+    region = Region.of(epoch.wcs, *_stars_pixels(epoch, rows))
+    wcs, residual = corrected_wcs(epoch.wcs, correction, region, pixel_map)
+    return replace(epoch, wcs=wcs, pixel_scale=None), residual
+
+
+def _stars_pixels(epoch, rows):
+    if not epoch.is_pixels or not len(rows):
+        return np.array([0.0]), np.array([0.0])
+    return tuple(numbers(epoch.table, key)[rows] for key in 'xy')
