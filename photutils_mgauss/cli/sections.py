@@ -223,7 +223,7 @@ _TABLES = (({'pmra', 'pmra_error'}, motion_section),
 
 def section_of(path):
     """Return the section on a result, or None for any other file."""
-    from photutils_mgauss.cli.tools import read_table
+    from photutils_mgauss.files.tables import read_table
     path = Path(path)
     if path.suffix not in ('.ecsv', '.fits', '.asdf', '.psf'):
         return None

@@ -1,5 +1,6 @@
 """The PSF images that a grid of mixtures is fitted to, from any source."""
 from dataclasses import dataclass
+from os import PathLike
 
 import numpy as np
 from photutils.psf import ImagePSF
@@ -90,11 +91,14 @@ def of_gridded_psf(psf):
     NodeImages
     """
     if not hasattr(psf, 'grid_xypos'):
-        msg = f'psf must be a GriddedPSFModel, got {psf!r:.80}'
+        hint = ('; GriddedMixturePSF.from_file reads files'
+                if isinstance(psf, str | PathLike) else '')
+        msg = f'psf must be a GriddedPSFModel, got {psf!r:.80}{hint}'
         raise TypeError(msg)
     oversampling = np.broadcast_to(psf.oversampling, 2).tolist()
-    return NodeImages(np.asarray(psf.data, dtype=float),
-                      _split_seams(np.array(psf.grid_xypos, float)),
+    positions = _split_seams(np.array(psf.grid_xypos, float))
+    _check_one_chip(positions)
+    return NodeImages(np.asarray(psf.data, dtype=float), positions,
                       tuple(oversampling))
 
 
@@ -163,6 +167,18 @@ def _split_seams(positions):
     for axis in (x, y):
         axis[1:] += np.diff(axis) == 0
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def _check_one_chip(positions):
+    """Raise if several nodes are at one place."""
+    places, counts = np.unique(positions, axis=0, return_counts=True)
+    if (counts > 1).any():
+        where = tuple(places[counts.argmax()].tolist())
+        msg = (f'psf must have one node at each place, got {counts.max()} '
+               f'nodes at {where}: the grid covers several chips. Give a '
+               'dict with the grid of each chip, or read an STDPSF file with '
+               "GriddedMixturePSF.from_file(path, detector='all')")
+        raise ValueError(msg)
 
 
 def _psfex_lattice(model, grid_shape, limits):
