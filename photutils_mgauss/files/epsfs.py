@@ -167,9 +167,9 @@ def read_stdpsf(path, detector=None):
         data = _cube(hdus[0], header, axes[0].size * axes[1].size)
         sampling = header.count('OVERSAMP', _STDPSF_SAMPLING, lowest=1)
         data = _flux_density(data, sampling)
-    chips = _chips(axes, data.reshape(axes[0].size, axes[1].size,
-                                      *data.shape[1:]), sampling)
-    return _chosen_chip(path, chips, detector)
+        chips = _chips(axes, data.reshape(
+            axes[0].size, axes[1].size, *data.shape[1:]), sampling)
+        return _chosen_chip(path, chips, detector)
 
 
 def _nodes_along(header, count, prefix):
@@ -203,7 +203,7 @@ def _cube(hdu, header, n):
     """Return the images (n, ny, nx) of an extension."""
     data = np.array(hdu.data, dtype=float)
     data = data[None] if data.ndim == 2 else data
-    if data.ndim != 3 or len(data) != n:
+    if data.ndim != 3 or len(data) != n or data.size == 0:
         header.fail(f'its keywords tell of {n} images, but the array has the '
                     f'shape {data.shape}')
     return data

@@ -16,6 +16,7 @@ from astropy.time import Time
 from astropy.utils.exceptions import AstropyUserWarning
 from astropy.wcs import WCS
 
+from photutils_mgauss.files.asdf_files import is_asdf, open_asdf
 from photutils_mgauss.files.damage import undamaged
 from photutils_mgauss.files.fits_files import chosen_hdu, label_of, open_fits
 from photutils_mgauss.files.image_header import Cards
@@ -113,12 +114,6 @@ def read_layers(path, *, ext=None, beside=None):
     given = {kind: Path(file) for kind, file in (beside or {}).items()
              if file}
     return _with_companions(path, layers, given)
-
-
-def is_asdf(path):
-    """Whether a file says that it is an ASDF file."""
-    with Path(path).open('rb') as file:
-        return file.read(5) == b'#ASDF'
 
 
 def _read_fits(path, ext):
@@ -221,15 +216,25 @@ def _fits_wcs(hdus, hdu):
         return wcs
     # The lists of HDUs have the tables of distortions.
     try:
-        wcs = WCS(hdu.header, hdus)
+        return _celestial(WCS(hdu.header, hdus))
     except Exception as error:
         # wcslib has errors of many kinds.
         words = ' '.join(str(error).split()) or type(error).__name__
         msg = f'a WCS that cannot be used: {words}'
         raise _WCSError(msg) from error
+
+
+def _celestial(wcs):
+    """Return the celestial part of a WCS, None if it has none."""
     if not wcs.has_celestial:
         return None
-    return wcs if wcs.naxis == 2 else wcs.celestial
+    wcs = wcs if wcs.naxis == 2 else wcs.celestial
+    wcs.wcs.set()
+    numbers = [wcs.wcs.crval, wcs.wcs.crpix, *wcs.pixel_scale_matrix]
+    if not np.isfinite(numbers).all():
+        msg = 'its numbers must be finite'
+        raise ValueError(msg)
+    return wcs
 
 
 class _WCSError(ValueError):
@@ -247,11 +252,9 @@ def _gwcs_inside(hdus):
 
 def _asdf_tree(file):
     """Return the whole tree of an ASDF file; unknown tags stay plain."""
-    import asdf
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')
-        with asdf.open(file, lazy_load=False, memmap=False,
-                       validate_checksums=True) as opened:
+        with open_asdf(file, lazy_load=False, memmap=False) as opened:
             return opened.tree
 
 

@@ -7,13 +7,12 @@ in columns, never in header cards, which would cost digits; so what is read
 is what was written, bit by bit. Nothing is pickled.
 """
 import warnings
-from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 from astropy.io import fits, registry
 from astropy.io.fits.connect import is_fits
 
+from photutils_mgauss.files.asdf_files import is_asdf, open_asdf
 from photutils_mgauss.files.damage import UnusableFileError, undamaged
 from photutils_mgauss.files.fits_files import name_of, open_fits
 from photutils_mgauss.files.layout import VERSION, check_version, complete
@@ -200,10 +199,9 @@ def read_stored(path):
     """
     import photutils_mgauss
     from photutils_mgauss.files.asdf_extension import CLASSES
-    with Path(path).open('rb') as file:
-        is_asdf = file.read(5) == b'#ASDF'
+    stands_in_asdf = is_asdf(path)
     with undamaged(path):
-        if is_asdf:
+        if stands_in_asdf:
             found = _stored_in_asdf(path)
             name = type(found[0]).__name__ if found else None
         else:
@@ -212,8 +210,8 @@ def read_stored(path):
         if name not in CLASSES:
             msg = f'{path}: must hold a PSF of this package, got {name}'
             raise UnusableFileError(msg)
-        return found[0] if is_asdf else getattr(photutils_mgauss,
-                                                name).read(path)
+        return found[0] if stands_in_asdf else getattr(
+            photutils_mgauss, name).read(path)
 
 
 def _plain_columns(hdu):
@@ -278,9 +276,6 @@ def _stored_in_asdf(file):
         warnings.simplefilter('error')
         warnings.simplefilter('ignore', asdf.exceptions.
                               AsdfPackageVersionWarning)
-        if hasattr(file, 'read'):
-            # asdf bypasses the buffer of files that others have looked into.
-            file = BytesIO(file.read())
-        with asdf.open(file, validate_checksums=True) as opened:
+        with open_asdf(file) as opened:
             return [value for value in opened.tree.values()
                     if type(value).__name__ in CLASSES]
