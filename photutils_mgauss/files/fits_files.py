@@ -14,6 +14,7 @@ import zipfile
 from contextlib import contextmanager
 from io import BytesIO
 from math import ceil, prod
+from os import PathLike
 from pathlib import Path
 
 from astropy.io import fits
@@ -76,8 +77,9 @@ def open_fits(file, what='an undamaged FITS file', *, checksum=False):
 
 def name_of(file):
     """Return the name of a file, open or not."""
-    name = getattr(file, 'name', file)
-    return name if isinstance(name, (str, Path)) else 'file'
+    if hasattr(file, 'read'):
+        file = getattr(file, 'name', 'file')
+    return file if isinstance(file, str | PathLike) else 'file'
 
 
 @contextmanager

@@ -7,6 +7,8 @@ in columns, never in header cards, which would cost digits; so what is read
 is what was written, bit by bit. Nothing is pickled.
 """
 import warnings
+from os import PathLike
+from pathlib import Path
 
 import numpy as np
 from astropy.io import fits, registry
@@ -49,6 +51,9 @@ class _Read(registry.UnifiedReadWrite):
         super().__init__(instance, cls, 'read')
 
     def __call__(self, path, *args, **kwargs):
+        if isinstance(path, str | PathLike):
+            # Says why it cannot be opened, which the registry does not.
+            Path(path).open('rb').close()
         with undamaged(name_of(path), 'an undamaged file of a '
                        f'{self._cls.__name__} (FITS or ASDF)'):
             return self.registry.read(self._cls, path, *args, **kwargs)
