@@ -132,8 +132,8 @@ def _read_fits(path, ext):
         wcs, problem = None, None
         try:
             wcs = _fits_wcs(hdus, hdu)
-        except _WCSError as error:
-            problem = str(error)
+        except _WCSError as wcs_error:
+            problem = str(wcs_error)
     if problem:
         # Stars can be measured without it.
         warnings.warn(f'{path}: has {problem}; it is left out',
@@ -231,8 +231,9 @@ def _celestial(wcs):
     wcs = wcs if wcs.naxis == 2 else wcs.celestial
     wcs.wcs.set()
     numbers = [wcs.wcs.crval, wcs.wcs.crpix, *wcs.pixel_scale_matrix]
-    if not np.isfinite(numbers).all():
-        msg = 'its numbers must be finite'
+    if (not np.isfinite(numbers).all()
+            or np.linalg.det(wcs.pixel_scale_matrix) == 0):
+        msg = 'its numbers must be finite, and its matrix not singular'
         raise ValueError(msg)
     return wcs
 
