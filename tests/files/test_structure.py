@@ -154,13 +154,14 @@ def test_two_extensions_of_one_name_are_not_chosen_by_it(tmp_path):
 
 @pytest.mark.parametrize('cards', [
     {'CTYPE1': 'GLON-TAN', 'CTYPE2': 'DEC--TAN'},
-    {'CD1_1': 0.0},
+    {'CD1_2': -1e-5, 'CD2_1': 1e-5},
     {'CRVAL1': 1e999}])
 def test_a_wcs_that_cannot_be_used_is_left_out_with_a_word(tmp_path, cards):
     hdu = fits.PrimaryHDU(DATA)
     hdu.header.update({'CTYPE1': 'RA---TAN', 'CTYPE2': 'DEC--TAN',
                        'CRVAL1': 10.0, 'CRVAL2': 2.0, 'CRPIX1': 1.0,
-                       'CRPIX2': 2.0, 'CD1_1': -1e-5, 'CD2_2': 1e-5})
+                       'CRPIX2': 2.0, 'CD1_1': -1e-5, 'CD2_2': 1e-5,
+                       'CD1_2': 0.0, 'CD2_1': 0.0})
     path = tmp_path / 'a.fits'
     hdu.writeto(path)
     assert read_layers(path).wcs is not None
