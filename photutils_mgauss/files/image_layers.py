@@ -230,9 +230,12 @@ def _celestial(wcs):
         return None
     wcs = wcs if wcs.naxis == 2 else wcs.celestial
     wcs.wcs.set()
-    numbers = [wcs.wcs.crval, wcs.wcs.crpix, *wcs.pixel_scale_matrix]
-    if not np.isfinite(numbers).all():
+    matrix = wcs.pixel_scale_matrix
+    if not np.isfinite([wcs.wcs.crval, wcs.wcs.crpix, *matrix]).all():
         msg = 'its numbers must be finite'
+        raise ValueError(msg)
+    if np.linalg.matrix_rank(matrix) < 2:
+        msg = f'its matrix must not be singular, got {matrix.tolist()}'
         raise ValueError(msg)
     return wcs
 
