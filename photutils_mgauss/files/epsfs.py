@@ -27,8 +27,8 @@ from photutils_mgauss.files.damage import UnusableFileError
 from photutils_mgauss.files.fits_files import open_fits, read_chosen
 from photutils_mgauss.files.keywords import Keywords
 
-__all__ = ['EPSFGrid', 'psf_kind', 'read_image_psf', 'read_stdpsf',
-           'read_stpsf']
+__all__ = ['EPSFGrid', 'places_in_meta', 'psf_kind', 'read_image_psf',
+           'read_stdpsf', 'read_stpsf']
 
 # What STPSF names the samples of the optical image and those of the pixels;
 # the first of each has the distortion of the camera in it.
@@ -331,6 +331,28 @@ def _places(header):
         header.fail('two PSFs at one place: one detector at a time can be '
                     'read')
     return places
+
+
+def places_in_meta(meta):
+    """
+    Return the places that keywords of STPSF in metadata tell.
+
+    Parameters
+    ----------
+    meta : dict
+        Such as `~photutils.psf.GriddedPSFModel` keeps of the file.
+
+    Returns
+    -------
+    (N, 2) `~numpy.ndarray` or None
+        The places (x, y) by the numbers of the images [pix]; None if there
+        are none.
+    """
+    cards = {str(key).upper(): value for key, value in meta.items()
+             if isinstance(value, str)}
+    if not _has_places(cards):
+        return None
+    return _places(Keywords(cards, 'psf.meta', _STPSF))
 
 
 def _stpsf_sampling(header, data):

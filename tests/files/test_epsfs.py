@@ -2,10 +2,13 @@
 import bz2
 import gzip
 import lzma
+import warnings
 
 import numpy as np
+import photutils
 import pytest
 from astropy.io import fits
+from astropy.utils import minversion
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import GriddedPSFModel, STDPSFGrid
 from scipy.special import erf
@@ -61,6 +64,24 @@ def test_the_keyword_of_stpsf_says_which_number_is_y(tmp_path, key, order):
     assert grid.oversampling == 4
     assert widths(grid) == {(x, y): round(1 + 0.1 * n, 6)
                             for n, (y, x) in enumerate(yx)}
+
+
+@pytest.mark.parametrize('yx', [
+    [(y, x) for y in (0.0, 100.0) for x in (0.0, 70.0, 90.0)],
+    [(y, x) for x in (0.0, 100.0) for y in (0.0, 100.0)]])
+def test_a_grid_of_stpsf_that_photutils_read_stands_right(tmp_path, yx):
+    planes = [gaussian(1 + y / 200) for y, _ in yx]
+    path = write_stpsf(tmp_path / 'a.fits', yx, planes=planes)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('always')
+        grid = GriddedPSFModel.read(path, format='webbpsf')
+        psf = GriddedMixturePSF.from_gridded_psf(grid, 1)
+    said = [str(warning.message) for warning in caught
+            if 'exchanges x and y' in str(warning.message)]
+    assert len(said) == (0 if minversion(photutils, '3.1') else 1)
+    for y, x in yx:
+        assert_allclose(psf.mixture_at(x, y).covariances[0, 0, 0],
+                        (1 + y / 200)**2, rtol=1e-3)
 
 
 def test_one_psf_of_stpsf_is_a_grid_of_one_node(tmp_path):
