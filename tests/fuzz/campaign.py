@@ -29,10 +29,14 @@ from pathlib import Path
 
 import asdf
 import astropy.units as u
+import gwcs
 import numpy as np
+from astropy.coordinates import ICRS
 from astropy.io import fits
+from astropy.modeling import models
 from astropy.table import QTable
 from astropy.wcs import WCS
+from gwcs import coordinate_frames
 from photutils.psf import ImagePSF
 
 import photutils_mgauss as mg
@@ -139,6 +143,28 @@ def write_layers(path):
         fits.ImageHDU(np.zeros(data.shape, 'i2'), name='DQ')]).writeto(path)
 
 
+def small_gwcs():
+    detector = coordinate_frames.Frame2D(name='detector')
+    sky = coordinate_frames.CelestialFrame(reference_frame=ICRS(), name='sky')
+    to_sky = (models.Shift(-8.0) & models.Shift(-9.0)
+              | models.Scale(1e-5) & models.Scale(1e-5)
+              | models.Pix2Sky_TAN()
+              | models.RotateNative2Celestial(10.0, 20.0, 180.0))
+    return gwcs.WCS([(detector, to_sky), (sky, None)])
+
+
+def write_with_gwcs(path):
+    """Write an image with its gwcs in an extension, as JWST does."""
+    write_layers(path)
+    buffer = io.BytesIO()
+    asdf.AsdfFile({'meta': {'wcs': small_gwcs()}}).write_to(buffer)
+    content = np.frombuffer(buffer.getvalue(), np.uint8)
+    column = fits.Column('ASDF_METADATA', f'{content.size}B',
+                         array=content[None])
+    with fits.open(path, mode='append') as hdus:
+        hdus.append(fits.BinTableHDU.from_columns([column], name='ASDF'))
+
+
 def write_packed(path):
     data = np.arange(40 * 32, dtype='i2').reshape(40, 32)
     fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(
@@ -199,6 +225,9 @@ KINDS = {
     'mixture.asdf': (lambda p: mixture().write(p), mg.GaussianMixture.read),
     'model.asdf': (lambda p: mg.MultiGaussianPSFModel(mixture()).write(p),
                    mg.MultiGaussianPSFModel.read),
+    'model.fits': (lambda p: mg.MultiGaussianPSFModel(mixture()).write(p),
+                   mg.MultiGaussianPSFModel.read),
+    'field.asdf': (lambda p: field().write(p), mg.MixtureField.read),
     'field.fits': (lambda p: field().write(p), mg.MixtureField.read),
     'chips.psf': (write_psfex, read_chips),
     'chips.psf.gz': (write_packed_copy(write_psfex), read_chips),
@@ -209,9 +238,11 @@ KINDS = {
     'epsfs.fits': (write_images, read_any_psf),
     'image.fits': (write_layers, image_layers.read_layers),
     'image.fits.fz': (write_packed, image_layers.read_layers),
+    'gwcs.fits': (write_with_gwcs, image_layers.read_layers),
     'image.asdf': (write_asdf_image, image_layers.read_layers),
     'wcs.fits': (write_layers, image_layers.read_wcs),
     'stars.ecsv': (lambda p: stars().write(p), read_table),
+    'stars.xml': (lambda p: stars().write(p, format='votable'), read_table),
     'stars.fits': (lambda p: fits_stars().write(p), read_table),
 }
 
@@ -308,7 +339,7 @@ COMMON = (truncate, flip, flip, overwrite, cut, repeat)
 def changes_for(name):
     if name.endswith('.gz'):
         return (*COMMON, inside, inside, inside)
-    if name.endswith(('.asdf', '.ecsv')):
+    if name.endswith(('.asdf', '.ecsv', '.xml')):
         return (*COMMON, *4 * (change_word,), drop_line, drop_line)
     return (*COMMON, *8 * (change_card,))
 
@@ -342,6 +373,7 @@ PARTS = {
     image_layers.Layers: parts_of,
     ImagePSF: lambda psf: [psf.data, psf.oversampling],
     WCS: words_of,
+    gwcs.WCS: lambda wcs: [*wcs(3, 4), wcs.output_frame],
     QTable: lambda table: [dict(table.items()), dict(table.meta)],
     u.Quantity: lambda quantity: [quantity.unit, quantity.value],
     np.ndarray: lambda array: [array.shape, array.dtype, str(array.tolist())],
