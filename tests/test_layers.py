@@ -154,7 +154,8 @@ def test_the_walk_through_the_house_leads_through_real_doors(name, call):
 
 def test_tests_stand_in_the_rooms_of_what_they_test():
     folders = {path.parent.name for path in TESTS.glob('*/test_*.py')}
-    assert folders <= ROWS.keys()
+    # The readers of all rooms are tried with damaged files in one place.
+    assert folders <= ROWS.keys() | {'fuzz'}
 
 
 @pytest.mark.parametrize('path', [

@@ -167,8 +167,9 @@ def _from_image(options, image, names, i):
 
 
 def _from_catalogue(options, i):
+    from photutils_mgauss.files.tables import read_table
     path = options.inputs[i]
-    table, record = tools.read_table(path)
+    table, record = read_table(path)
     exposure = record.get('exposure', {})
     time = tools.parse_time(tools.one_each(options.time, len(options.inputs),
                                            'time')[i])
@@ -260,7 +261,8 @@ def _fit(epochs, options):
 def _references(options):
     if options.references is None:
         return None
-    table, _ = tools.read_table(options.references)
+    from photutils_mgauss.files.tables import read_table
+    table, _ = read_table(options.references)
     if options.reference_class is not None:
         table['class'] = options.reference_class
     # Identifiers of another catalogue say nothing about these stars.

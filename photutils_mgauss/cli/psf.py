@@ -52,8 +52,9 @@ def add_fit(parser):
 
 def _add_files(parser):
     group = parser.add_argument_group('PSF files')
-    group.add_argument('--detector', type=int, metavar='NUMBER',
-                       help='detector of an STDPSF file')
+    group.add_argument('--detector', metavar='NUMBER',
+                       help='detector of an STDPSF file of several; for '
+                            'other files with several PSFs use --ext')
     group.add_argument('--oversampling', type=tools.count, metavar='N',
                        help='of an ePSF image without OVERSAMP')
 
@@ -96,7 +97,8 @@ def from_file(path, options):
         raise ValueError(msg)
     return read_psf(path, n_components=3 if number is None else number,
                     grid_shape=tuple(options.grid_shape),
-                    radius=options.radius, detector=options.detector,
+                    radius=options.radius, ext=options.ext,
+                    detector=options.detector,
                     oversampling=options.oversampling,
                     progress_bar=not options.quiet)
 
@@ -124,9 +126,10 @@ def from_stars(image, options):
 
 def _choose(image, radius, options):
     from photutils_mgauss.field.selection import select_psf_stars
+    from photutils_mgauss.files.tables import read_table
     sources = None
     if options.stars is not None:
-        sources, _ = tools.read_table(options.stars)
+        sources, _ = read_table(options.stars)
     saturation = image.saturation
     if saturation is not None:
         # The level is that of the image with its sky.

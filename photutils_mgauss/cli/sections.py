@@ -223,13 +223,14 @@ _TABLES = (({'pmra', 'pmra_error'}, motion_section),
 
 def section_of(path):
     """Return the section on a result, or None for any other file."""
-    from photutils_mgauss.cli.tools import read_table
+    from photutils_mgauss.files.tables import read_table
     path = Path(path)
-    if path.suffix not in ('.ecsv', '.fits', '.asdf', '.psf'):
+    suffix = Path(path.name.removesuffix('.gz')).suffix
+    if suffix not in ('.ecsv', '.fits', '.asdf', '.psf'):
         return None
-    if path.suffix != '.ecsv' and psf_kind(path) != 'image':
+    if suffix != '.ecsv' and psf_kind(path) != 'image':
         return psf_section(path)
-    if path.suffix in ('.asdf', '.psf'):
+    if suffix in ('.asdf', '.psf'):
         return None
     try:
         table, record = read_table(path)

@@ -5,13 +5,13 @@ import os
 import re
 import sys
 import warnings
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
 from tqdm import tqdm
 
 from photutils_mgauss import __version__
+from photutils_mgauss.files.whole import whole_file
 
 # What is no option of a run.
 _NOT_STORED = ('run', 'quiet', 'overwrite')
@@ -258,23 +258,6 @@ def claim(paths, overwrite):
             raise PermissionError(msg)
 
 
-@contextmanager
-def whole_file(path):
-    """
-    Give a name to write to; the file gets its own name once it is whole.
-
-    The name has the same suffix and stands in the same folder. Whatever goes
-    wrong, nothing is left of it.
-    """
-    path = Path(path)
-    draft = path.with_name(f'.{path.stem}.{os.getpid()}{path.suffix}')
-    try:
-        yield draft
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
-
-
 def record_of(options, **more):
     """Return what is stored with results: command, options, version, date."""
     used = {name: value for name, value in vars(options).items()
@@ -297,27 +280,6 @@ def write_table(table, path, record):
         # FITS has no electrons; astropy notes them down all the same.
         warnings.filterwarnings('ignore', 'The unit .* could not be saved')
         table.write(draft)
-
-
-def read_table(path):
-    """
-    Return a table and the record of the run that made it.
-
-    The record is empty for tables of other programs.
-    """
-    from astropy.table import QTable
-    try:
-        table = QTable.read(path)
-    except OSError:
-        raise
-    except Exception as error:
-        # Readers of tables raise what they please.
-        msg = f'{path}: must be a table that astropy can read, got: {error}'
-        raise ValueError(msg) from error
-    text = table.meta.get('MGRUN')
-    record = table.meta.get('mgauss', {}) if text is None else (
-        json.loads(text))
-    return table, record
 
 
 def say(options, *lines):

@@ -6,6 +6,7 @@ opens: so it imports little but asdf. The objects' own modules load when one
 of them is read.
 """
 from contextlib import contextmanager
+from functools import cache
 from importlib.resources import files
 
 import asdf
@@ -104,12 +105,27 @@ def resource_mappings():
              for name in CLASSES}]
 
 
+@cache
+def _own():
+    """Return the extension and the schemas, the same ones every time."""
+    return extensions(), resource_mappings()
+
+
 @contextmanager
 def enabled():
-    """Let asdf know this package even where it is not installed."""
+    """
+    Let asdf know this package even where it is not installed.
+
+    asdf keeps all it has made of an extension for as long as it runs. So
+    each is made once: ours here, and those of other packages in the
+    configuration outside the context, from which the context copies them.
+    """
+    asdf.get_config().extensions  # noqa: B018
+    asdf.get_config().resource_mappings  # noqa: B018
+    own, mappings = _own()
     with asdf.config_context() as config:
-        for mapping in resource_mappings():
+        for mapping in mappings:
             config.add_resource_mapping(mapping)
-        for extension in extensions():
+        for extension in own:
             config.add_extension(extension)
         yield

@@ -11,6 +11,13 @@ _READ_NOISE = ('RDNOISE', 'READNOIS', 'RON', 'READNSEA')
 _EXPOSURE_TIME = ('EXPTIME', 'XPOSURE', 'EFFEXPTM', 'TEXPTIME', 'EXPOSURE')
 _SATURATION = ('SATURATE', 'SATLEVEL', 'SATURAT')
 
+# Numbers in headers are smaller, which leaves out infinity.
+_HUGE = 1e300
+
+# Modified Julian dates of the years 1000 and 3000: no image is older or
+# newer.
+_OLDEST, _NEWEST = -313_000, 455_000
+
 # Spellings of what detectors count, and of "each second".
 _COUNTED = {'e': u.electron, 'e-': u.electron, 'electron': u.electron,
             'electrons': u.electron, 'adu': u.adu, 'dn': u.DN,
@@ -51,7 +58,7 @@ class Cards:
         for key in keys:
             value = self.get(key)
             if (isinstance(value, (int, float, np.number))
-                    and not isinstance(value, bool) and np.isfinite(value)):
+                    and not isinstance(value, bool) and abs(value) < _HUGE):
                 return float(value)
         return None
 
@@ -96,7 +103,7 @@ class Cards:
         scale = str(self.get('TIMESYS') or 'utc').strip().lower()
         scale = scale if scale in Time.SCALES else 'utc'
         for find in (_middle, _middle_of_limits, _start_and_length):
-            time = find(self, scale)
+            time = _believable(find, self, scale)
             if time is not None:
                 return time
         return None
@@ -134,6 +141,17 @@ def electrons_in_unit(unit, gain, exposure_time):
         if unit == counted / u.s:
             return each and exposure_time and each * exposure_time
     return None
+
+
+def _believable(find, cards, scale):
+    """Return the time that is found, None for what is no time of an image."""
+    try:
+        time = find(cards, scale)
+    except ValueError:
+        # Of dates far away erfa does not know the leap seconds.
+        return None
+    return (time if time is not None and _OLDEST < time.mjd < _NEWEST
+            else None)
 
 
 def _middle(cards, scale):

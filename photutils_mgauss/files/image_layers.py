@@ -6,18 +6,22 @@ ASDF of Roman, and files beside an image as CSST has them.
 """
 import warnings
 from collections.abc import Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from astropy.io import fits
 from astropy.nddata.bitmask import bitfield_to_boolean_mask
 from astropy.time import Time
+from astropy.utils.exceptions import AstropyUserWarning
 from astropy.wcs import WCS
 
+from photutils_mgauss.files.asdf_files import is_asdf, open_asdf
+from photutils_mgauss.files.damage import undamaged
+from photutils_mgauss.files.fits_files import chosen_hdu, label_of, open_fits
 from photutils_mgauss.files.image_header import Cards
+
+_IMAGE = 'an undamaged FITS or ASDF image'
 
 # Names of extensions with the noise, and what is in them.
 _NOISE = {'ERR': 'error', 'ERROR': 'error', 'UNCERT': 'error',
@@ -104,49 +108,19 @@ def read_layers(path, *, ext=None, beside=None):
         If a file cannot be read or has no such image.
     """
     path = Path(path)
-    layers = (_read_asdf(path) if is_asdf(path) else _read_fits(path, ext))
+    with undamaged(path, _IMAGE):
+        layers = (_read_asdf(path) if is_asdf(path)
+                  else _read_fits(path, ext))
     given = {kind: Path(file) for kind, file in (beside or {}).items()
              if file}
     return _with_companions(path, layers, given)
 
 
-def is_asdf(path):
-    """Whether a file says that it is an ASDF file."""
-    with Path(path).open('rb') as file:
-        return file.read(5) == b'#ASDF'
-
-
-@contextmanager
-def open_fits(path):
-    """Open a FITS file; what is wrong with it becomes one kind of error."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter('always')
-        try:
-            hdus = fits.open(path, memmap=False, ignore_missing_end=True)
-        except OSError as error:
-            if isinstance(error, (FileNotFoundError, IsADirectoryError,
-                                  PermissionError)):
-                raise
-            raise _damaged(path, error) from error
-        with hdus:
-            len(hdus)  # reads all headers
-            # Of a truncated file astropy only warns.
-            for warning in caught:
-                if 'truncated' in str(warning.message):
-                    raise _damaged(path, warning.message)
-            yield hdus
-
-
-def _damaged(path, error):
-    return ValueError(f'{path}: must be an undamaged FITS or ASDF image, '
-                      f'got: {error}')
-
-
 def _read_fits(path, ext):
-    with open_fits(path) as hdus:
+    with open_fits(path, _IMAGE) as hdus:
         hdu = _science(path, hdus, ext)
         data = _plane(path, hdu)
-        sources = {'image': _name(hdus, hdu)}
+        sources = {'image': label_of(hdus, hdu)}
         error = _first(path, hdus, hdu, _NOISE, sources, 'error')
         if error is not None:
             kind = _NOISE[sources['error'].split(',')[0]]
@@ -155,7 +129,15 @@ def _read_fits(path, ext):
         weight = _first(path, hdus, hdu, ('WHT',), {}, 'weight')
         covered = None if weight is None else weight > 0
         cards = Cards(hdu.header, hdus[0].header)
-        wcs = _fits_wcs(hdus, hdu)
+        wcs, problem = None, None
+        try:
+            wcs = _fits_wcs(hdus, hdu)
+        except _WCSError as wcs_error:
+            problem = str(wcs_error)
+    if problem:
+        # Stars can be measured without it.
+        warnings.warn(f'{path}: has {problem}; it is left out',
+                      AstropyUserWarning, stacklevel=2)
     layers = Layers(data, error, flags, covered, cards, wcs, sources)
     for name in ('error', 'flags', 'covered'):
         _check_shape(path, getattr(layers, name), layers, name)
@@ -175,7 +157,7 @@ def _science(path, hdus, ext):
     if not found:
         msg = f'{path}: must hold an image of 2 dimensions, got none'
         raise ValueError(msg)
-    names = ', '.join(_name(hdus, hdu) for hdu in found)
+    names = ', '.join(label_of(hdus, hdu) for hdu in found)
     msg = (f'{path}: --ext must say which image to take, for there are '
            f'{len(found)}: {names}')
     raise ValueError(msg)
@@ -186,34 +168,17 @@ def _is_image(hdu):
 
 
 def _chosen(path, hdus, images, ext):
-    name, _, version = str(ext).partition(',')
-    key = int(name) if name.isdigit() else (
-        (name, int(version)) if version.isdigit() else name)
-    try:
-        hdu = hdus[key]
-    except (KeyError, IndexError):
-        hdu = None
-    if hdu is None or not any(hdu is image for image in images):
-        names = ', '.join(_name(hdus, image) for image in images)
+    hdu = chosen_hdu(hdus, images, ext)
+    if hdu is None:
+        names = ', '.join(label_of(hdus, image) for image in images)
         msg = (f'{path}: --ext must name an image of 2 dimensions '
                f'({names or "there is none"}), got {ext}')
         raise ValueError(msg)
     return hdu
 
 
-def _name(hdus, hdu):
-    """Return what to call an extension in --ext."""
-    if not hdu.name or hdu.name == 'PRIMARY':
-        return str(hdus.index(hdu))
-    several = sum(other.name == hdu.name for other in hdus) > 1
-    return f'{hdu.name},{hdu.ver}' if several else hdu.name
-
-
 def _plane(path, hdu):
-    try:
-        data = hdu.data
-    except (OSError, ValueError, TypeError, Warning) as error:
-        raise _damaged(path, error) from error
+    data = hdu.data
     if data is None or data.ndim != 2 or data.dtype.kind not in 'iuf':
         msg = f'{path}: must hold an image of 2 dimensions, got {data!r:.80}'
         raise ValueError(msg)
@@ -225,7 +190,7 @@ def _first(path, hdus, science, names, sources, what):
     for hdu in hdus:
         if (hdu.name in names and hdu.ver == science.ver
                 and hdu is not science and _is_image(hdu)):
-            sources[what] = _name(hdus, hdu)
+            sources[what] = label_of(hdus, hdu)
             if what == 'flags':
                 return np.array(hdu.data)
             return _plane(path, hdu)
@@ -250,10 +215,33 @@ def _fits_wcs(hdus, hdu):
     if wcs is not None:
         return wcs
     # The lists of HDUs have the tables of distortions.
-    wcs = WCS(hdu.header, hdus)
+    try:
+        return _celestial(WCS(hdu.header, hdus))
+    except Exception as error:
+        # wcslib has errors of many kinds.
+        words = ' '.join(str(error).split()) or type(error).__name__
+        msg = f'a WCS that cannot be used: {words}'
+        raise _WCSError(msg) from error
+
+
+def _celestial(wcs):
+    """Return the celestial part of a WCS, None if it has none."""
     if not wcs.has_celestial:
         return None
-    return wcs if wcs.naxis == 2 else wcs.celestial
+    wcs = wcs if wcs.naxis == 2 else wcs.celestial
+    wcs.wcs.set()
+    matrix = wcs.pixel_scale_matrix
+    if not np.isfinite([wcs.wcs.crval, wcs.wcs.crpix, *matrix]).all():
+        msg = 'its numbers must be finite'
+        raise ValueError(msg)
+    if np.linalg.matrix_rank(matrix) < 2:
+        msg = f'its matrix must not be singular, got {matrix.tolist()}'
+        raise ValueError(msg)
+    return wcs
+
+
+class _WCSError(ValueError):
+    """The keywords of a WCS contradict each other."""
 
 
 def _gwcs_inside(hdus):
@@ -267,10 +255,9 @@ def _gwcs_inside(hdus):
 
 def _asdf_tree(file):
     """Return the whole tree of an ASDF file; unknown tags stay plain."""
-    import asdf
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')
-        with asdf.open(file, lazy_load=False, memmap=False) as opened:
+        with open_asdf(file, lazy_load=False, memmap=False) as opened:
             return opened.tree
 
 
@@ -299,7 +286,7 @@ def read_wcs(path):
     if is_asdf(path):
         wcs = find_gwcs(read_asdf_tree(path))
     else:
-        with open_fits(path) as hdus:
+        with open_fits(path, _IMAGE) as hdus:
             found = [_fits_wcs(hdus, hdu) for hdu in hdus if hdu.is_image]
         wcs = next((one for one in found if one is not None), None)
     if wcs is None:
@@ -310,13 +297,8 @@ def read_wcs(path):
 
 def read_asdf_tree(path):
     """Return the tree of an ASDF file; damage becomes a ValueError."""
-    try:
+    with undamaged(path, 'an undamaged ASDF file'):
         return _asdf_tree(path)
-    except OSError:
-        raise
-    except Exception as error:
-        # Whatever YAML, blocks and schemas can go wrong with.
-        raise _damaged(path, error) from error
 
 
 def _read_asdf(path):
@@ -410,7 +392,7 @@ def _companions(path):
 
 
 def _add_companion(layers, kind, file):
-    with open_fits(file) as hdus:
+    with open_fits(file, _IMAGE) as hdus:
         images = [hdu for hdu in hdus if _is_image(hdu)]
         if len(images) != 1:
             msg = f'{file}: must hold one image, got {len(images)}'

@@ -15,16 +15,26 @@ groups :math:`g`; the powers of one group add up to its degree at most, and
 every term of one group is multiplied by every term of the others.
 """
 import re
-import warnings
 from dataclasses import dataclass
-from math import prod
+from math import comb, prod
 
 import numpy as np
-from astropy.io import fits
 
+from photutils_mgauss.files.damage import UnusableFileError
+from photutils_mgauss.files.fits_files import (
+    name_of,
+    open_fits,
+    read_chosen,
+)
+from photutils_mgauss.files.keywords import Keywords
 from photutils_mgauss.utils.validation import as_real
 
 __all__ = ['PSFExModel', 'read_psfex']
+
+# No model has more images.
+_MOST_TERMS = 10_000
+
+_UNDAMAGED = 'an undamaged PSFEx model'
 
 _POSITION = re.compile(r'([XY])(WIN|PSF|PEAK|MODEL)?_IMAGE(_DBL)?$')
 
@@ -159,25 +169,33 @@ def _position_axis(name):
     return match and match.group(1)
 
 
-def read_psfex(path):
+def read_psfex(path, *, ext=None):
     """
     Read a PSF model made by PSFEx.
 
     Parameters
     ----------
     path : str, path-like or file-like
-        A ``.psf`` file: any polynomial degree, any number of contexts and
-        context groups.
+        A ``.psf`` file, which may be compressed: any polynomial degree, any
+        number of contexts and context groups.
+    ext : int, str or (str, int) tuple, optional
+        Which model to read from a file that has one for each chip of a
+        mosaic: the number of the extension, its name, or name and version
+        (``'PSF_DATA,2'``). ``'all'`` reads all of them.
 
     Returns
     -------
-    PSFExModel
+    PSFExModel or dict of them
+        With ``ext='all'`` a dict, whose keys ``ext`` would take.
 
     Raises
     ------
+    OSError
+        If the file cannot be opened.
     ValueError
         If the file is not a PSFEx model, is damaged, or depends on a keyword
-        of the image's header, whose value at a star it does not tell.
+        of the image's header, whose value at a star it does not tell; or if
+        it holds several models and ``ext`` does not say which to read.
 
     Examples
     --------
@@ -185,9 +203,25 @@ def read_psfex(path):
     >>> model = read_psfex('chip_12.psf')  # doctest: +SKIP
     >>> model.image_at(1023, 512).shape  # doctest: +SKIP
     (25, 25)
+    >>> chips = read_psfex('mosaic.psf', ext='all')  # doctest: +SKIP
+    >>> list(chips)  # doctest: +SKIP
+    [1, 2]
     """
-    header, data = _read_table(path)
-    header = _Header(header, path)
+    name = name_of(path)
+    with open_fits(path, _UNDAMAGED) as hdus:
+        tables = [hdu for hdu in hdus if 'PSF_SAMP' in hdu.header]
+        if not tables:
+            msg = (f'{name}: must be a PSFEx model, but no table has the '
+                   'keyword PSF_SAMP')
+            raise UnusableFileError(msg)
+        return read_chosen(name, hdus, tables, ext,
+                           lambda hdu: _model_in(hdu, name))
+
+
+def _model_in(hdu, name):
+    """Return the model of an extension."""
+    data = np.array(hdu.data['PSF_MASK'], dtype=float)
+    header = Keywords(hdu.header, name, _UNDAMAGED)
     sampling = header.number('PSF_SAMP')
     if not sampling > 0:
         header.fail(f'PSF_SAMP must be positive, got {sampling}')
@@ -196,75 +230,30 @@ def read_psfex(path):
     return PSFExModel(planes, exponents, names, zeros, scales, sampling)
 
 
-def _read_table(path):
-    """Return header and first column of the table that holds the PSF."""
-    try:
-        with warnings.catch_warnings():
-            # Astropy only warns of truncated files.
-            warnings.simplefilter('error')
-            with fits.open(path) as hdus:
-                for hdu in hdus:
-                    if 'PSF_SAMP' in hdu.header:
-                        return hdu.header.copy(), np.array(
-                            hdu.data['PSF_MASK'], dtype=float)
-    except (OSError, Warning, KeyError, TypeError, ValueError,
-            IndexError) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
-        msg = (f'path must name an undamaged PSFEx model, got {path}: '
-               f'{error}')
-        raise ValueError(msg) from error
-    msg = (f'path must name a PSFEx model, got {path}, in which no table has '
-           'the keyword PSF_SAMP')
-    raise ValueError(msg)
-
-
-class _Header:
-    """A header whose missing and wrong cards are errors that name the file."""
-
-    def __init__(self, header, path):
-        self._header = header
-        self._path = path
-
-    def fail(self, problem):
-        msg = f'path must name an undamaged PSFEx model, got {self._path}: '
-        raise ValueError(msg + problem)
-
-    def number(self, key, default=None):
-        value = self._header.get(key, default)
-        if value is None:
-            self.fail(f'the keyword {key} is missing')
-        if isinstance(value, (bool, str)) or not np.isfinite(value):
-            self.fail(f'{key} must be a number, got {value!r}')
-        return value
-
-    def text(self, key):
-        value = self._header.get(key)
-        if not isinstance(value, str):
-            self.fail(f'the keyword {key} is missing')
-        return value.strip()
-
-
 def _polynomial(header):
     """Return names, zero points, scales and exponents of the contexts."""
     # A constant model has no contexts, and PSFEx may leave out all keywords.
-    numbers = range(1, int(header.number('POLNAXIS', 0)) + 1)
+    numbers = range(1, header.count('POLNAXIS', 0) + 1)
     names = tuple(header.text(f'POLNAME{v}') for v in numbers)
     for name in names:
         if name.startswith(':'):
             header.fail(f'it depends on {name!r}, a keyword of the image '
                         'header; models of pixel positions and measured '
                         'columns can be read')
-    groups = [int(header.number(f'POLGRP{v}')) for v in numbers]
-    n_groups = int(header.number('POLNGRP', 0)) if names else 0
+    groups = [header.count(f'POLGRP{v}') for v in numbers]
+    n_groups = header.count('POLNGRP', 0) if names else 0
     if any(not 1 <= group <= n_groups for group in groups):
         header.fail(f'POLGRP must be 1 to POLNGRP = {n_groups}, got {groups}')
-    degrees = [int(header.number(f'POLDEG{g}'))
-               for g in range(1, n_groups + 1)]
+    degrees = [header.count(f'POLDEG{g}') for g in range(1, n_groups + 1)]
     zeros = np.array([header.number(f'POLZERO{v}') for v in numbers])
     scales = np.array([header.number(f'POLSCAL{v}') for v in numbers])
-    if (scales == 0).any() or any(degree < 0 for degree in degrees):
-        header.fail('POLSCAL must not be 0, nor POLDEG negative')
+    if (scales == 0).any():
+        header.fail('POLSCAL must not be 0')
+    n_terms = prod(comb(groups.count(group) + degree, degree)
+                   for group, degree in enumerate(degrees, 1))
+    if n_terms > _MOST_TERMS:
+        header.fail(f'POLDEG must be smaller, got {degrees} for {n_terms} '
+                    'images')
     return names, zeros, scales, _exponents(groups, degrees)
 
 
@@ -291,8 +280,8 @@ def _exponents(groups, degrees):
 
 def _planes(header, data, n_terms):
     """Return the images (T, ny, nx) if all numbers in the file agree."""
-    n_axes = int(header.number('PSFNAXIS'))
-    shape = [int(header.number(f'PSFAXIS{i}')) for i in range(n_axes, 0, -1)]
+    n_axes = header.count('PSFNAXIS')
+    shape = [header.count(f'PSFAXIS{i}') for i in range(n_axes, 0, -1)]
     shape = [1] * (3 - n_axes) + shape
     if len(shape) != 3 or shape[0] != n_terms:
         header.fail(f'its polynomial has {n_terms} terms, but PSFAXIS tells '

@@ -7,16 +7,20 @@ in columns, never in header cards, which would cost digits; so what is read
 is what was written, bit by bit. Nothing is pickled.
 """
 import warnings
-from io import BytesIO
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
 from astropy.io import fits, registry
 from astropy.io.fits.connect import is_fits
 
+from photutils_mgauss.files.asdf_files import is_asdf, open_asdf
+from photutils_mgauss.files.damage import UnusableFileError, undamaged
+from photutils_mgauss.files.fits_files import name_of, open_fits
 from photutils_mgauss.files.layout import VERSION, check_version, complete
+from photutils_mgauss.files.whole import whole_file
 
-__all__ = ['storable', 'table_columns']
+__all__ = ['read_stored', 'storable', 'table_columns']
 
 
 class _Read(registry.UnifiedReadWrite):
@@ -32,6 +36,8 @@ class _Read(registry.UnifiedReadWrite):
 
     Raises
     ------
+    OSError
+        If the file cannot be opened.
     ValueError
         If the file is damaged, was made by a newer version, or holds
         something else.
@@ -44,8 +50,13 @@ class _Read(registry.UnifiedReadWrite):
     def __init__(self, instance, cls):
         super().__init__(instance, cls, 'read')
 
-    def __call__(self, *args, **kwargs):
-        return self.registry.read(self._cls, *args, **kwargs)
+    def __call__(self, path, *args, **kwargs):
+        if isinstance(path, str | PathLike):
+            # Says why it cannot be opened, which the registry does not.
+            Path(path).open('rb').close()
+        with undamaged(name_of(path), 'an undamaged file of a '
+                       f'{self._cls.__name__} (FITS or ASDF)'):
+            return self.registry.read(self._cls, path, *args, **kwargs)
 
 
 class _Write(registry.UnifiedReadWrite):
@@ -64,7 +75,10 @@ class _Write(registry.UnifiedReadWrite):
     Raises
     ------
     OSError
-        If the file exists and ``overwrite`` is not set.
+        If the file exists and ``overwrite`` is not set, or cannot be
+        written; an older file then stays as it was.
+    ValueError
+        If neither ``format`` nor the name of the file tells the format.
 
     Notes
     -----
@@ -74,8 +88,13 @@ class _Write(registry.UnifiedReadWrite):
     def __init__(self, instance, cls):
         super().__init__(instance, cls, 'write')
 
-    def __call__(self, *args, **kwargs):
-        self.registry.write(self._instance, *args, **kwargs)
+    def __call__(self, path, *args, **kwargs):
+        try:
+            self.registry.write(self._instance, path, *args, **kwargs)
+        except registry.IORegistryError as error:
+            msg = (f'{name_of(path)}: must end with .fits or .asdf, or '
+                   "format must be 'fits' or 'asdf'")
+            raise ValueError(msg) from error
 
 
 def storable(**tables):
@@ -131,8 +150,12 @@ def _write_fits(stored, file, *, overwrite=False):
     primary.header['MGVERS'] = VERSION, 'version of the layout'
     hdus = [_table_hdu(name, columns, cls._columns.get(name, {}))
             for name, columns in stored._to_tables().items()]
-    fits.HDUList([primary, *hdus]).writeto(file, overwrite=overwrite,
-                                           checksum=True)
+    hdus = fits.HDUList([primary, *hdus])
+    if hasattr(file, 'write'):
+        hdus.writeto(file, checksum=True)
+        return
+    with whole_file(file, overwrite=overwrite) as draft:
+        hdus.writeto(draft, overwrite=True, checksum=True)
 
 
 def _table_hdu(name, columns, units):
@@ -154,22 +177,46 @@ def _fits_column(name, values, unit):
 
 
 def _read_fits(cls, file):
-    try:
-        with warnings.catch_warnings():
-            # Astropy only warns of truncation and of wrong checksums.
-            warnings.simplefilter('error')
-            with fits.open(file, checksum=True, memmap=False) as hdus:
-                header = hdus[0].header.copy()
-                tables = {hdu.name.lower(): _plain_columns(hdu)
-                          for hdu in hdus[1:]}
-    except FileNotFoundError:
-        raise
-    except (OSError, Warning, TypeError, ValueError, KeyError,
-            IndexError) as error:
-        raise _damaged(file, error) from error
-    _check_class(header.get('MGCLASS'), cls, file)
-    check_version(header.get('MGVERS', 0), 'file')
-    return complete(cls, tables, 'file')
+    name = name_of(file)
+    with open_fits(file, 'undamaged', checksum=True) as hdus:
+        header = hdus[0].header
+        _check_class(header.get('MGCLASS'), cls, name)
+        check_version(header.get('MGVERS', 0), name)
+        tables = {hdu.name.lower(): _plain_columns(hdu) for hdu in hdus[1:]}
+        return complete(cls, tables, name)
+
+
+def read_stored(path):
+    """
+    Return the object of this package in a file, of whichever class.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A FITS or ASDF file made by `write`.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened.
+    ValueError
+        If it is damaged or holds no such object.
+    """
+    import photutils_mgauss
+    from photutils_mgauss.files.asdf_extension import CLASSES
+    stands_in_asdf = is_asdf(path)
+    with undamaged(path):
+        if stands_in_asdf:
+            found = _stored_in_asdf(path)
+            name = type(found[0]).__name__ if found else None
+        else:
+            with open_fits(path, 'undamaged') as hdus:
+                name = hdus[0].header.get('MGCLASS')
+        if name not in CLASSES:
+            msg = f'{path}: must hold a PSF of this package, got {name}'
+            raise UnusableFileError(msg)
+        return found[0] if stands_in_asdf else getattr(
+            photutils_mgauss, name).read(path)
 
 
 def _plain_columns(hdu):
@@ -183,17 +230,12 @@ def _native(column):
     return column.astype(column.dtype.newbyteorder('='))
 
 
-def _damaged(file, error):
-    name = getattr(file, 'name', file)
-    return ValueError(f'file must be undamaged, got {name}: {error}')
-
-
-def _check_class(found, cls, file):
+def _check_class(found, cls, name):
     if found != cls.__name__:
-        msg = (f'file must hold a {cls.__name__}, got '
-               f'{getattr(file, "name", file)} with '
-               f'{found or "nothing of this package"}')
-        raise ValueError(msg)
+        msg = (f'{name}: file must hold a {cls.__name__}, got one with '
+               f'{found or "nothing of this package"}; '
+               'GriddedMixturePSF.from_file takes the PSFs of other programs')
+        raise UnusableFileError(msg)
 
 
 def _is_asdf(origin, path, file, *args, **kwargs):
@@ -214,23 +256,19 @@ def _write_asdf(stored, file, *, overwrite=False):
         if hasattr(file, 'write'):
             tree.write_to(file)
             return
-        with Path(file).open('wb' if overwrite else 'xb') as target:
-            tree.write_to(target)
+        with whole_file(file, overwrite=overwrite) as draft:
+            tree.write_to(draft)
 
 
 def _read_asdf(cls, file):
-    try:
+    name = name_of(file)
+    with undamaged(name):
         found = _stored_in_asdf(file)
-    except FileNotFoundError:
-        raise
-    except Exception as error:
-        # Whatever YAML, blocks and schemas can go wrong with.
-        raise _damaged(file, error) from error
     for value in found:
         if isinstance(value, cls):
             return value
     names = ', '.join(type(value).__name__ for value in found)
-    _check_class(names, cls, file)
+    _check_class(names, cls, name)
     return None
 
 
@@ -241,9 +279,8 @@ def _stored_in_asdf(file):
     with enabled(), warnings.catch_warnings():
         # An unknown version of a tag is only a warning of asdf.
         warnings.simplefilter('error')
-        if hasattr(file, 'read'):
-            # asdf bypasses the buffer of files that others have looked into.
-            file = BytesIO(file.read())
-        with asdf.open(file) as opened:
+        warnings.simplefilter('ignore', asdf.exceptions.
+                              AsdfPackageVersionWarning)
+        with open_asdf(file) as opened:
             return [value for value in opened.tree.values()
                     if type(value).__name__ in CLASSES]

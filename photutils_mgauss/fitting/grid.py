@@ -7,7 +7,7 @@ from photutils_mgauss.fitting.node_images import (
     of_psfex,
 )
 from photutils_mgauss.fitting.nodes import fit_nodes
-from photutils_mgauss.psf.grid import make_grid
+from photutils_mgauss.psf.grid import check_lattice, make_grid
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 
 
@@ -31,6 +31,7 @@ def fit_image_psf(psf, n_components, *, grid_xypos, **kwargs):
 def fit_node_images(nodes, n_components, *, scaled=True,
                     interpolation='blend', outside='clamp', **kwargs):
     """Fit images and return the grid with the report of the fits."""
+    check_lattice(nodes.positions)
     mixtures, scales, report = fit_nodes(nodes, n_components, **kwargs)
     if not any(mixtures):
         msg = ('psf must have at least one image that can be fitted, but '

@@ -1,10 +1,15 @@
 """The PSF images that a grid of mixtures is fitted to, from any source."""
+import warnings
 from dataclasses import dataclass
+from os import PathLike
 
 import numpy as np
+from astropy.utils.exceptions import AstropyUserWarning
 from photutils.psf import ImagePSF
 
+from photutils_mgauss.files.epsfs import places_in_meta
 from photutils_mgauss.files.psfex import read_psfex
+from photutils_mgauss.utils import compat
 from photutils_mgauss.utils.validation import as_floats, as_shape
 
 __all__ = ['NodeImages', 'of_gridded_psf', 'of_image_psf', 'of_psfex']
@@ -90,12 +95,42 @@ def of_gridded_psf(psf):
     NodeImages
     """
     if not hasattr(psf, 'grid_xypos'):
-        msg = f'psf must be a GriddedPSFModel, got {psf!r:.80}'
+        hint = ('; GriddedMixturePSF.from_file reads files'
+                if isinstance(psf, str | PathLike) else '')
+        msg = f'psf must be a GriddedPSFModel, got {psf!r:.80}{hint}'
         raise TypeError(msg)
     oversampling = np.broadcast_to(psf.oversampling, 2).tolist()
-    return NodeImages(np.asarray(psf.data, dtype=float),
-                      _split_seams(np.array(psf.grid_xypos, float)),
+    positions = _split_seams(_positions(psf))
+    _check_one_chip(positions)
+    return NodeImages(np.asarray(psf.data, dtype=float), positions,
                       tuple(oversampling))
+
+
+def _positions(psf):
+    """Return the places (x, y) of a photutils grid, as its file has them."""
+    positions = np.array(psf.grid_xypos, float)
+    meta = getattr(psf, 'meta', None) or {}
+    places = (places_in_meta(meta) if compat.EXCHANGED_STPSF_NODES
+              else None)
+    if places is None:
+        return positions
+    read = np.array(meta['grid_xypos'], float)
+    # As photutils orders images.
+    order = np.lexsort(read.T)
+    if not (_alike(read, places[:, ::-1])
+            and np.array_equal(read[order], positions)
+            and not np.array_equal(places[order], positions)):
+        return positions
+    warnings.warn('psf: this version of photutils exchanges x and y of the '
+                  'nodes in files of STPSF; the mixtures stand where the '
+                  'keywords DET_YXn say', AstropyUserWarning, stacklevel=2)
+    return places[order]
+
+
+def _alike(a, b):
+    """Whether two sets of places are the same in any order."""
+    return a.shape == b.shape and np.array_equal(
+        a[np.lexsort(a.T)], b[np.lexsort(b.T)])
 
 
 def of_psfex(path, grid_shape, *, limits=None, contexts=None):
@@ -163,6 +198,18 @@ def _split_seams(positions):
     for axis in (x, y):
         axis[1:] += np.diff(axis) == 0
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def _check_one_chip(positions):
+    """Raise if several nodes are at one place."""
+    places, counts = np.unique(positions, axis=0, return_counts=True)
+    if (counts > 1).any():
+        where = tuple(places[counts.argmax()].tolist())
+        msg = (f'psf must have one node at each place, got {counts.max()} '
+               f'nodes at {where}: the grid covers several chips. Give a '
+               'dict with the grid of each chip, or read an STDPSF file with '
+               "GriddedMixturePSF.from_file(path, detector='all')")
+        raise ValueError(msg)
 
 
 def _psfex_lattice(model, grid_shape, limits):

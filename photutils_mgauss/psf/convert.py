@@ -10,9 +10,98 @@ from functools import partial
 import numpy as np
 from photutils.psf import GriddedPSFModel
 
+from photutils_mgauss.files.damage import UnusableFileError
+from photutils_mgauss.files.storage import read_stored
+
+# The kinds of files of which a user may choose an extension or a detector.
+_WITH_EXTENSIONS = ('psfex', 'stpsf', 'optical', 'epsf')
+_WITH_DETECTORS = ('stdpsf',)
+
 
 class GridConversions:
     """The constructors and conversions of `GriddedMixturePSF`."""
+
+    @classmethod
+    def from_file(cls, path, n_components=3, *, ext=None, detector=None,
+                  oversampling=None, grid_shape=(30, 30), **kwargs):
+        """
+        Make a grid of the PSF in a file of any kind.
+
+        Parameters
+        ----------
+        path : str or path-like
+            A file of this package (a grid, a field or a mixture), a PSFEx
+            model, a grid of ePSFs as STDPSF or STPSF write it, what
+            ``calc_psf`` of STPSF writes, or images of one ePSF each. It may
+            be compressed (``.fits.gz``, ``.psf.gz``).
+        n_components : int, optional
+            The number K of Gaussians, where mixtures are to be fitted.
+        ext : int, str or (str, int) tuple, optional
+            The extension with the PSF, by number, name, or name and version,
+            of PSFEx models and images of which the file holds several;
+            ``'all'`` for a dict of all. Of a ``calc_psf`` file it is
+            OVERDIST by default, or else OVERSAMP.
+        detector : int or str, optional
+            The chip of an STDPSF file that covers several, numbered as in
+            `~photutils.psf.GriddedPSFModel`; ``'all'`` for a dict of all.
+        oversampling : int, optional
+            Samples per pixel of images whose header has no OVERSAMP.
+        grid_shape : int or (ny, nx) tuple of int, optional
+            The number of nodes along y and x, for PSFs that are functions
+            of the position: PSFEx models and fields.
+        **kwargs
+            As for `from_gridded_psf`, where mixtures are to be fitted.
+
+        Returns
+        -------
+        GriddedMixturePSF or dict of them
+            It contains the pixel; optical images are integrated over it.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be opened.
+        ValueError
+            If the file is damaged, holds no PSF, or several and neither
+            ``ext`` nor ``detector`` says which to read.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from astropy.io import fits
+        >>> from photutils_mgauss import GriddedMixturePSF
+        >>> y, x = np.mgrid[-20:21, -20:21] / 4
+        >>> chips = [fits.ImageHDU(np.exp(-(x**2 + y**2) / 2 / width**2),
+        ...                        name=f'CHIP{width}') for width in (1, 2)]
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / 'epsfs.fits'
+        ...     fits.HDUList([fits.PrimaryHDU(), *chips]).writeto(path)
+        ...     psfs = GriddedMixturePSF.from_file(
+        ...         path, 1, ext='all', oversampling=4)
+        >>> {name: float(round(psf.mixtures[0].moments().covariance[0, 0], 3))
+        ...  for name, psf in psfs.items()}
+        {'CHIP1': 1.0, 'CHIP2': 4.0}
+        """
+        from photutils_mgauss.files import epsfs
+        kind = epsfs.psf_kind(path)
+        if kind == 'image' and oversampling is not None:
+            kind = 'epsf'
+        _check_choices(path, kind, ext=ext, detector=detector)
+        if kind == 'mixtures':
+            return _of_stored(cls, path, grid_shape)
+        if kind == 'psfex':
+            return cls.from_psfex(path, n_components, ext=ext,
+                                  grid_shape=grid_shape, **kwargs)
+        if kind in ('optical', 'epsf'):
+            images = epsfs.read_image_psf(path, ext=ext,
+                                          oversampling=oversampling)
+            return _of_each(images, partial(
+                cls.from_image_psf, n_components=n_components, **kwargs))
+        grid = (epsfs.read_stdpsf(path, detector) if kind == 'stdpsf'
+                else epsfs.read_stpsf(path, ext))
+        return cls.from_gridded_psf(grid, n_components, **kwargs)
 
     @classmethod
     def from_gridded_psf(cls, psf, n_components=3, *, radius=None,
@@ -25,7 +114,9 @@ class GridConversions:
         psf : `~photutils.psf.GriddedPSFModel` or `~photutils.psf.STDPSFGrid`
             The grid of ePSFs, or a dict of them: one for each detector.
             Where two chips meet an STDPSF grid has two nodes at one place;
-            the one of the upper or right chip is put one pixel further.
+            the one of the upper or right chip is put one pixel further. A
+            `~photutils.psf.GriddedPSFModel` does not tell which of the two
+            is whose, and is refused.
         n_components : int, optional
             The number K of Gaussians.
         radius : float, optional
@@ -53,7 +144,8 @@ class GridConversions:
         Raises
         ------
         ValueError
-            If no node can be fitted.
+            If two nodes are at one place, the nodes form no rectangular
+            grid, or no node can be fitted.
 
         Examples
         --------
@@ -71,8 +163,8 @@ class GridConversions:
             executor=executor, progress_bar=progress_bar, **kwargs))
 
     @classmethod
-    def from_psfex(cls, path, n_components=3, *, grid_shape=(30, 30),
-                   limits=None, contexts=None, **kwargs):
+    def from_psfex(cls, path, n_components=3, *, ext=None,
+                   grid_shape=(30, 30), limits=None, contexts=None, **kwargs):
         """
         Fit mixtures to a PSFEx model, evaluated on a grid.
 
@@ -82,6 +174,9 @@ class GridConversions:
             The ``.psf`` file, or one for each detector.
         n_components : int, optional
             The number K of Gaussians.
+        ext : int, str or (str, int) tuple, optional
+            Which model of a file with several, as in `read_psfex`; ``'all'``
+            for a dict of all.
         grid_shape : int or (ny, nx) tuple of int, optional
             The number of nodes along y and x. There is one along an axis
             that the model does not depend on.
@@ -102,9 +197,13 @@ class GridConversions:
         Raises
         ------
         ValueError
-            If the file is not a PSFEx model, see `read_psfex`.
+            If the file is not a PSFEx model, or holds several and ``ext``
+            does not say which to read, see `read_psfex`.
         """
+        from photutils_mgauss.files.psfex import read_psfex
         from photutils_mgauss.fitting import grid
+        if ext is not None:
+            path = _of_each(path, partial(read_psfex, ext=ext))
         return _of_each(path, partial(
             grid.fit_psfex, n_components=n_components, grid_shape=grid_shape,
             limits=limits, contexts=contexts, **kwargs))
@@ -255,6 +354,32 @@ class GridConversions:
         `matplotlib.figure.Figure`
         """
         return self.to_gridded_psf(2).plot_grid(**kwargs)
+
+
+def _check_choices(path, kind, *, ext, detector):
+    """Raise for a kind of file that has no PSF, or no such choice."""
+    if kind == 'image':
+        msg = (f'{path}: must hold a PSF: one of this package, a PSFEx model, '
+               'a grid of ePSFs, or an image with the keyword OVERSAMP')
+        raise UnusableFileError(msg)
+    for name, value, kinds in (('ext', ext, _WITH_EXTENSIONS),
+                               ('detector', detector, _WITH_DETECTORS)):
+        if value is not None and kind not in kinds:
+            msg = (f'{path}: {name} (--{name}) must not be given for a file '
+                   f'of this kind ({kind}), got {value}')
+            raise ValueError(msg)
+
+
+def _of_stored(cls, path, grid_shape):
+    """Return what a file of this package holds, as a grid."""
+    stored = read_stored(path)
+    if isinstance(stored, cls):
+        return stored
+    if hasattr(stored, 'to_grid'):
+        return stored.to_grid(grid_shape)
+    integrated = getattr(stored, 'pixel_integrated', False)
+    mixture = getattr(stored, 'mixture', stored)
+    return cls([mixture], [(0, 0)], pixel_integrated=integrated)
 
 
 def _of_each(source, make):

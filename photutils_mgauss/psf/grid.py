@@ -21,7 +21,7 @@ from photutils_mgauss.psf.mixture import GaussianMixture, _check_covariances
 from photutils_mgauss.psf.rows import integrals, kernel_rows, of_integrals
 from photutils_mgauss.utils.validation import as_floats
 
-__all__ = ['Grid', 'make_grid']
+__all__ = ['Grid', 'check_lattice', 'make_grid']
 
 _serial = count()
 
@@ -215,6 +215,23 @@ def _check_mixtures(mixtures):
                'got none')
         raise ValueError(msg)
     return mixtures
+
+
+def check_lattice(positions):
+    """
+    Check the places of nodes before anything is fitted.
+
+    Parameters
+    ----------
+    positions : (M, 2) `~numpy.ndarray`
+        The positions (x, y) [pix].
+
+    Raises
+    ------
+    ValueError
+        If two are at one place, or they do not form a rectangular grid.
+    """
+    _lattice(positions)
 
 
 def _lattice(positions):

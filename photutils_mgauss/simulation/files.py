@@ -14,6 +14,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 
+from photutils_mgauss.files.whole import whole_file
 from photutils_mgauss.utils.validation import as_choice
 
 
@@ -31,11 +32,14 @@ def write_scene(scene, path, layout, overwrite):
                f'{existing[0]}, which exists')
         raise FileExistsError(msg)
     for file, hdus in zip(paths, images.values(), strict=False):
-        fits.HDUList(hdus).writeto(file, overwrite=True)
+        with whole_file(file) as draft:
+            fits.HDUList(hdus).writeto(draft)
     truth = scene.truth.copy()
     truth['flux'] = truth['flux'].value * u.electron
-    truth.write(paths[-2], overwrite=True)
-    asdf.AsdfFile({'wcs': scene.wcs}).write_to(paths[-1])
+    with whole_file(paths[-2]) as draft:
+        truth.write(draft)
+    with whole_file(paths[-1]) as draft:
+        asdf.AsdfFile({'wcs': scene.wcs}).write_to(draft)
     return paths
 
 

@@ -19,6 +19,9 @@ from photutils.utils._misc import _get_meta
 # later model.
 STALE_GROUP_MODELS = not minversion(photutils, '3.1')
 
+# Before 3.1, photutils takes the places (y, x) in files of STPSF for (x, y).
+EXCHANGED_STPSF_NODES = not minversion(photutils, '3.1')
+
 _CLASSES = WeakValueDictionary()
 
 

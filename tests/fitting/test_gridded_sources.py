@@ -3,9 +3,16 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from astropy.nddata import NDData
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
-from photutils.psf import EPSFBuilder, EPSFStar, EPSFStars, ImagePSF
+from photutils.psf import (
+    EPSFBuilder,
+    EPSFStar,
+    EPSFStars,
+    GriddedPSFModel,
+    ImagePSF,
+)
 
 from helpers.psf_grids import (
     PLACES,
@@ -21,6 +28,7 @@ from photutils_mgauss import (
     fit_mixture,
     read_psfex,
 )
+from photutils_mgauss.fitting import grid as fitting_grid
 
 
 def test_the_mixtures_of_an_epsf_grid_and_its_flux_scale_come_back():
@@ -132,6 +140,43 @@ def test_two_chips_side_by_side_have_a_seam():
         PlainGrid(data, {'grid_xypos': places, 'oversampling': 3}), 2)
     assert_array_equal(psf.grid_xypos[::2, 1], [0, 20, 21, 40])
     assert_array_equal(psf.grid_xypos[:2, 0], [5, 9])
+
+
+def two_chips():
+    """Return a grid of photutils with four nodes at two places."""
+    data = epsf_grid().data[:1].repeat(8, axis=0)
+    places = [(x, y) for y in (0, 20, 20, 40) for x in (5, 9)]
+    return GriddedPSFModel(NDData(data, meta={'grid_xypos': places,
+                                              'oversampling': 3}))
+
+
+def no_lattice():
+    data = epsf_grid().data[:4]
+    return PlainGrid(data, {'grid_xypos': [(0, 0), (5, 0), (0, 5), (6, 6)],
+                            'oversampling': 3})
+
+
+@pytest.mark.parametrize(('grid', 'words'), [
+    (two_chips, r'got 2 nodes at \(5\.0, 20\.0\): .* covers several chips'),
+    (no_lattice, 'grid_xypos must form a rectangular grid')])
+def test_wrong_places_are_refused_before_anything_is_fitted(
+        monkeypatch, grid, words):
+    def fit(*args, **kwargs):
+        raise AssertionError
+    monkeypatch.setattr(fitting_grid, 'fit_nodes', fit)
+    with pytest.raises(ValueError, match=words):
+        GriddedMixturePSF.from_gridded_psf(grid(), 1)
+
+
+def test_the_grids_of_two_chips_are_taken_one_by_one():
+    first, second = epsf_grid(), epsf_grid()
+    psfs = GriddedMixturePSF.from_gridded_psf({1: first, 2: second}, 2)
+    assert_is_truth(psfs[2], rtol=1e-6)
+
+
+def test_the_name_of_a_file_is_no_grid():
+    with pytest.raises(TypeError, match='from_file reads files'):
+        GriddedMixturePSF.from_gridded_psf('PSFSTD_WFC3UV_F814W.fits')
 
 
 def test_one_image_psf_makes_a_grid_of_one_node():
