@@ -69,7 +69,7 @@ def _class_in_asdf(path):
     return next((name for name in names if name in _CLASSES), None)
 
 
-def read_psf(path, *, n_components=3, grid_shape=(30, 30), radius=None,
+def read_psf(path, *, n_components=None, grid_shape=(30, 30), radius=None,
              detector=None, oversampling=None, progress_bar=False):
     """
     Read a PSF file as a grid of mixtures.
@@ -80,7 +80,8 @@ def read_psf(path, *, n_components=3, grid_shape=(30, 30), radius=None,
         A file of this package (a grid, a field, a mixture), a PSFEx model, a
         grid of ePSFs as STDPSF or STPSF write it, or an image of one ePSF.
     n_components : int, optional
-        The number of Gaussians fitted to images.
+        The number of Gaussians fitted to images; see
+        `GriddedMixturePSF.from_gridded_psf`.
     grid_shape : int or (ny, nx) tuple of int, optional
         The number of nodes for models that are no grid.
     radius : float, optional

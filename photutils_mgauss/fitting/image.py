@@ -21,7 +21,7 @@ from photutils_mgauss.fitting.search import (
     draw_model,
     mixture_of,
     narrow_first,
-    refine_astrometry,
+    refine_phases,
     run,
     search,
     stamp_shapes,
@@ -222,12 +222,13 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
         Whether weights may be negative.
     means : {'free', 'fixed'}, optional
         Whether each Gaussian has its own mean, or all are at the origin.
-    weighting : {'uniform', 'astrometric'}, optional
+    weighting : {'uniform', 'astrometric', 'photometric'}, optional
         Whether only the residual is made small, or also the pixel-phase
-        errors it causes: those of the centroids of noise-free stars, fitted
-        in stamps of 5 x 5 and 7 x 7 native pixels with the star at many
-        phases of the pixels. They are linear in the residual and enter the
-        sum of squares as more rows. It needs an oversampling of 2 or more.
+        errors it causes: those of noise-free stars at many phases of the
+        pixels, of their centroids in stamps of 5 x 5 and 7 x 7 native pixels
+        with 'astrometric', of their fluxes in 5 x 5 pixels with
+        'photometric'. They are linear in the residual and enter the sum of
+        squares as more rows. It needs an oversampling of 2 or more.
     start : GaussianMixture or sequence of them, optional
         Where to start, one mixture of K Gaussians for all images or one for
         each, such as the fit of a neighbour. None tries several starts of
@@ -255,8 +256,9 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
     The parameters of each Gaussian are its mean and the Cholesky factor of
     its precision matrix, so that every step is a valid mixture; fluxes are
     solved for exactly at each step. Standard deviations are kept above 0.4
-    image pixels and below the size of the stamp, and means on the stamp, by a
-    price that is zero inside these limits.
+    image pixels (also above a quarter of a native pixel with the weighting
+    'photometric') and below the size of the stamp, and means on the stamp, by
+    a price that is zero inside these limits.
 
     Examples
     --------
@@ -283,7 +285,7 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
         tied=as_choice(normalize, 'normalize', ('free', 'tied')) == 'tied',
         signed=bool(signed),
         fixed=as_choice(means, 'means', ('free', 'fixed')) == 'fixed',
-        astrometric=_as_astrometric(weighting, oversampling),
+        weighting=_as_weighting(weighting, oversampling),
         has_error=pixels.error is not None)
     weights = _as_weights(pixels)
     starts = _as_starts(start, len(images), problem)
@@ -305,13 +307,14 @@ def _optional(value, name, **limits):
     return None if value is None else as_real(value, name, **limits)
 
 
-def _as_astrometric(weighting, oversampling):
-    choice = as_choice(weighting, 'weighting', ('uniform', 'astrometric'))
-    if choice == 'astrometric' and np.min(oversampling) < 2:
-        msg = ("oversampling must be at least 2 with weighting='astrometric', "
+def _as_weighting(weighting, oversampling):
+    choice = as_choice(weighting, 'weighting',
+                       ('uniform', 'astrometric', 'photometric'))
+    if choice != 'uniform' and np.min(oversampling) < 2:
+        msg = (f'oversampling must be at least 2 with weighting={choice!r}, '
                f'got {oversampling}')
         raise ValueError(msg)
-    return choice == 'astrometric'
+    return choice
 
 
 def _as_origin(origin, shape):
@@ -373,8 +376,8 @@ def _fit_image(problem, spaces, image, weight, start):
     else:
         solution = run(stamp, problem, spaces,
                        stamp_shapes(start, problem, stamp.centre))
-    if problem.astrometric and solution.has_flux:
-        solution = refine_astrometry(stamp, problem, spaces, solution)
+    if problem.weighting != 'uniform' and solution.has_flux:
+        solution = refine_phases(stamp, problem, spaces, solution)
     if not solution.has_flux:
         return _failure(FitStatus.EMPTY, image)
     return _report(problem, stamp, image, narrow_first(solution),

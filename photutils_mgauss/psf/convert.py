@@ -15,7 +15,7 @@ class GridConversions:
     """The constructors and conversions of `GriddedMixturePSF`."""
 
     @classmethod
-    def from_gridded_psf(cls, psf, n_components=3, *, radius=None,
+    def from_gridded_psf(cls, psf, n_components=None, *, radius=None,
                          executor=None, progress_bar=False, **kwargs):
         """
         Fit mixtures to the ePSFs of a photutils grid.
@@ -27,7 +27,12 @@ class GridConversions:
             Where two chips meet an STDPSF grid has two nodes at one place;
             the one of the upper or right chip is put one pixel further.
         n_components : int, optional
-            The number K of Gaussians.
+            The number K of Gaussians. By default 3; where these would make
+            fluxes change by more than 0.3 % rms with the place of a star in
+            its pixel, as for undersampled cameras, 5 or 8, fitted with the
+            weighting ``'photometric'`` of `fit_mixture` where the
+            oversampling allows it. A warning tells where even that is not
+            enough.
         radius : float, optional
             Only ePSF pixels within this distance of the star are fitted
             [native pix]. By default the largest circle that keeps two
@@ -71,7 +76,7 @@ class GridConversions:
             executor=executor, progress_bar=progress_bar, **kwargs))
 
     @classmethod
-    def from_psfex(cls, path, n_components=3, *, grid_shape=(30, 30),
+    def from_psfex(cls, path, n_components=None, *, grid_shape=(30, 30),
                    limits=None, contexts=None, **kwargs):
         """
         Fit mixtures to a PSFEx model, evaluated on a grid.
@@ -81,7 +86,7 @@ class GridConversions:
         path : str, path-like, `PSFExModel` or a dict of these
             The ``.psf`` file, or one for each detector.
         n_components : int, optional
-            The number K of Gaussians.
+            The number K of Gaussians; see `from_gridded_psf`.
         grid_shape : int or (ny, nx) tuple of int, optional
             The number of nodes along y and x. There is one along an axis
             that the model does not depend on.
@@ -110,7 +115,7 @@ class GridConversions:
             limits=limits, contexts=contexts, **kwargs))
 
     @classmethod
-    def from_image_psf(cls, psf, n_components=3, *, grid_xypos=None,
+    def from_image_psf(cls, psf, n_components=None, *, grid_xypos=None,
                        **kwargs):
         """
         Fit mixtures to one or several ePSF images.
@@ -122,7 +127,7 @@ class GridConversions:
             One for the whole detector, or one for each of ``grid_xypos``,
             of equal shapes, origins and oversampling.
         n_components : int, optional
-            The number K of Gaussians.
+            The number K of Gaussians; see `from_gridded_psf`.
         grid_xypos : (N, 2) array_like, optional
             The positions (x, y) of several ePSFs [pix]. Nodes that are
             missing from a rectangular grid are bridged.

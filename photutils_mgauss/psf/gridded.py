@@ -159,7 +159,10 @@ n_components=1)>
         ``chi2`` of the fit; ``size_error`` and ``ellipticity_error``, the
         dR^2/R^2 and d-epsilon of Eq. 8 by adaptive moments, and ``e1``,
         ``e2`` of the image; ``phase_error``, half the range of the shift
-        with pixel phase that the residual causes [pix]; ``enclosed_flux``;
+        with pixel phase that the residual causes [pix];
+        ``flux_phase_error``, the standard deviation over the pixel phases of
+        a flux fitted in 5 x 5 pixels, as a fraction of it, that of faint or
+        of bright stars, whichever is greater; ``enclosed_flux``;
         ``bridged``, whether the node was filled from its neighbours;
         ``status`` and ``message`` of the fit, -1 for mixtures not fitted.
         """
