@@ -27,6 +27,7 @@ from photutils_mgauss.fitting.search import (
     stamp_shapes,
 )
 from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.image import check_errors, read_stack, with_unit
 from photutils_mgauss.utils.parallel import map_chunks
 from photutils_mgauss.utils.validation import (
@@ -64,6 +65,7 @@ class FitStatus(IntEnum):
     EMPTY = 4
     NOT_FINITE = 5
     TOO_FEW_PIXELS = 6
+    NO_STAR = 7
 
     @property
     def sentence(self):
@@ -94,11 +96,15 @@ _SENTENCES = {
     FitStatus.TOO_FEW_PIXELS:
         'Fewer pixels are usable than the Gaussians have parameters; use a '
         'larger stamp or radius, or fewer Gaussians.',
+    FitStatus.NO_STAR:
+        'The pixels are more negative than positive, or show no star above '
+        'their noise; positive light is needed (negate the image of a '
+        'negative star).',
 }
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MixtureFit:
+class MixtureFit(ComparedByValue):
     """
     The result of `fit_mixture` for one image.
 
@@ -461,6 +467,8 @@ def _report(problem, stamp, image, solution, space):
     n = np.count_nonzero(used)
     weight = weight[used] * stamp.weight_unit
     chi2 = float((weight * residual[used] ** 2).sum())
+    if _is_noise((weight * image[used] ** 2).sum(), chi2, n, problem):
+        return _failure(FitStatus.NO_STAR, image)
     covariance = covariance_of(problem, stamp, solution, space)
     if not problem.has_error:
         covariance *= chi2 / max(n - problem.n_parameters, 1)
@@ -469,6 +477,19 @@ def _report(problem, stamp, image, solution, space):
         mixture, status, status.sentence, float(stamp.scale * total / area),
         chi2, _bic(chi2, n, problem), float(model[used].sum()), residual,
         covariance, used)
+
+
+def _is_noise(power, chi2, n, problem):
+    """
+    Return whether a model takes no more from n pixels than from noise.
+
+    Of white noise the best of all places and shapes takes about this many
+    times the variance, which is that of the residual: a negative star is
+    there, too.
+    """
+    p = problem.n_parameters
+    variance = chi2 / max(n - p, 1)
+    return power - chi2 < (2 * p + 4 * np.log(n)) * variance
 
 
 def _judge(solution, stamp):

@@ -281,7 +281,8 @@ n_components=1)>
         Returns
         -------
         list of `~numpy.ndarray`
-            One array of the shape of x for each parameter.
+            One array of the shape of x for each parameter, with what is tied
+            to it.
         """
         flux = float(np.squeeze(split_flux(flux)[0]))
         (x, y), shape = flat_points(x, y)
@@ -290,7 +291,8 @@ n_components=1)>
         self._run(1, x, y, x_0, y_0, out=out)
         self._mark_outside(x_0, y_0, out)
         out[1:] *= flux
-        return list(out.reshape(3, *shape))
+        return self._along_ties(list(out.reshape(3, *shape)),
+                                (flux, x_0, y_0))
 
     def mixture_at(self, x, y):
         """
