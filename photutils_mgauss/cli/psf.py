@@ -95,7 +95,7 @@ def from_file(path, options):
     if number == 'auto':
         msg = f'{path}: --n-components must be a number for PSF files'
         raise ValueError(msg)
-    return read_psf(path, n_components=3 if number is None else number,
+    return read_psf(path, n_components=number,
                     grid_shape=tuple(options.grid_shape),
                     radius=options.radius, ext=options.ext,
                     detector=options.detector,

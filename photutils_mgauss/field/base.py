@@ -4,12 +4,13 @@ from astropy.table import QTable
 
 from photutils_mgauss.field.forms import mixture_arrays
 from photutils_mgauss.field.normal import model_stamps, to_vector
+from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.image import with_unit
 from photutils_mgauss.utils.star_columns import words_column
 from photutils_mgauss.utils.validation import as_real
 
 
-class Field:
+class Field(ComparedByValue):
     """A PSF that varies over a detector; ``mixture_at`` gives it."""
 
     def _described(self, details=''):

@@ -24,6 +24,7 @@ from photutils_mgauss.field.base import lattice
 from photutils_mgauss.field.fit import fit_mixture_field
 from photutils_mgauss.field.input import normalised, read_sample
 from photutils_mgauss.field.mixture_field import MixtureField
+from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 __all__ = ['EmpiricalPSF']
@@ -35,7 +36,7 @@ _PRIOR_FALL = 0.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class EmpiricalPSF:
+class EmpiricalPSF(ComparedByValue):
     """
     PSF images that are polynomials of detector position.
 

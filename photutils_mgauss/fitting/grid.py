@@ -1,12 +1,17 @@
 """Grids of mixtures fitted to the PSFs of other programs."""
-import numpy as np
+import warnings
 
+import numpy as np
+from astropy.utils.exceptions import AstropyUserWarning
+
+from photutils_mgauss.fitting.node_choice import choose
 from photutils_mgauss.fitting.node_images import (
     of_gridded_psf,
     of_image_psf,
     of_psfex,
 )
 from photutils_mgauss.fitting.nodes import fit_nodes
+from photutils_mgauss.fitting.phases import FLUX_LIMIT
 from photutils_mgauss.psf.grid import check_lattice, make_grid
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 
@@ -32,6 +37,8 @@ def fit_node_images(nodes, n_components, *, scaled=True,
                     interpolation='blend', outside='clamp', **kwargs):
     """Fit images and return the grid with the report of the fits."""
     check_lattice(nodes.positions)
+    if n_components is None:
+        n_components, kwargs = choose(nodes, kwargs)
     mixtures, scales, report = fit_nodes(nodes, n_components, **kwargs)
     if not any(mixtures):
         msg = ('psf must have at least one image that can be fitted, but '
@@ -39,6 +46,7 @@ def fit_node_images(nodes, n_components, *, scaled=True,
         raise ValueError(msg)
     grid, order = make_grid(mixtures, nodes.positions,
                             scales if scaled else None)
+    _warn_of_phases(report, n_components)
     report = report[order]
     report['id'] = np.arange(1, len(report) + 1)
     report['bridged'] = [mixtures[i] is None for i in order]
@@ -46,3 +54,18 @@ def fit_node_images(nodes, n_components, *, scaled=True,
     report['n_components'] = (grid.weights != 0).sum(axis=1)
     return GriddedMixturePSF._of_grid(
         grid, report, interpolation=interpolation, outside=outside)
+
+
+def _warn_of_phases(report, n_components):
+    """Warn of fluxes that change with the place of a star in its pixel."""
+    errors = report['flux_phase_error']
+    n = np.count_nonzero(errors > FLUX_LIMIT)
+    if n:
+        warnings.warn(
+            f'fluxes measured with these mixtures of {n_components} Gaussians '
+            'change with the place of a star in its pixel by up to '
+            f'{100 * np.nanmax(errors):.1f} % rms, by more than '
+            f'{100 * FLUX_LIMIT:.1f} % at {n} of {len(report)} nodes (column '
+            "flux_phase_error of the report); more Gaussians or "
+            "weighting='photometric' make this smaller", AstropyUserWarning,
+            stacklevel=5)

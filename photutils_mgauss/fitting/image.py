@@ -19,13 +19,14 @@ from photutils_mgauss.fitting.search import (
     covariance_of,
     mixture_of,
     narrow_first,
-    refine_astrometry,
+    refine_phases,
     run,
     search,
     stamp_shapes,
     workspace,
 )
 from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.image import check_errors, read_stack, with_unit
 from photutils_mgauss.utils.parallel import map_chunks
 from photutils_mgauss.utils.validation import (
@@ -63,6 +64,7 @@ class FitStatus(IntEnum):
     EMPTY = 4
     NOT_FINITE = 5
     TOO_FEW_PIXELS = 6
+    NO_STAR = 7
 
     @property
     def sentence(self):
@@ -93,11 +95,15 @@ _SENTENCES = {
     FitStatus.TOO_FEW_PIXELS:
         'Fewer pixels are usable than the Gaussians have parameters; use a '
         'larger stamp or radius, or fewer Gaussians.',
+    FitStatus.NO_STAR:
+        'The pixels are more negative than positive, or show no star above '
+        'their noise; positive light is needed (negate the image of a '
+        'negative star).',
 }
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MixtureFit:
+class MixtureFit(ComparedByValue):
     """
     The result of `fit_mixture` for one image.
 
@@ -221,12 +227,13 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
         Whether weights may be negative.
     means : {'free', 'fixed'}, optional
         Whether each Gaussian has its own mean, or all are at the origin.
-    weighting : {'uniform', 'astrometric'}, optional
+    weighting : {'uniform', 'astrometric', 'photometric'}, optional
         Whether only the residual is made small, or also the pixel-phase
-        errors it causes: those of the centroids of noise-free stars, fitted
-        in stamps of 5 x 5 and 7 x 7 native pixels with the star at many
-        phases of the pixels. They are linear in the residual and enter the
-        sum of squares as more rows. It needs an oversampling of 2 or more.
+        errors it causes: those of noise-free stars at many phases of the
+        pixels, of their centroids in stamps of 5 x 5 and 7 x 7 native pixels
+        with 'astrometric', of their fluxes in 5 x 5 pixels with
+        'photometric'. They are linear in the residual and enter the sum of
+        squares as more rows. It needs an oversampling of 2 or more.
     start : GaussianMixture or sequence of them, optional
         Where to start, one mixture of K Gaussians for all images or one for
         each, such as the fit of a neighbour. None tries several starts of
@@ -254,8 +261,9 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
     The parameters of each Gaussian are its mean and the Cholesky factor of
     its precision matrix, so that every step is a valid mixture; fluxes are
     solved for exactly at each step. Standard deviations are kept above 0.4
-    image pixels and below the size of the stamp, and means on the stamp, by a
-    price that is zero inside these limits.
+    image pixels (also above a quarter of a native pixel with the weighting
+    'photometric') and below the size of the stamp, and means on the stamp, by
+    a price that is zero inside these limits.
 
     Examples
     --------
@@ -282,7 +290,7 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
         tied=as_choice(normalize, 'normalize', ('free', 'tied')) == 'tied',
         signed=bool(signed),
         fixed=as_choice(means, 'means', ('free', 'fixed')) == 'fixed',
-        astrometric=_as_astrometric(weighting, oversampling),
+        weighting=_as_weighting(weighting, oversampling),
         has_error=pixels.error is not None)
     weights = _as_weights(pixels)
     starts = _as_starts(start, len(images), problem)
@@ -304,13 +312,14 @@ def _optional(value, name, **limits):
     return None if value is None else as_real(value, name, **limits)
 
 
-def _as_astrometric(weighting, oversampling):
-    choice = as_choice(weighting, 'weighting', ('uniform', 'astrometric'))
-    if choice == 'astrometric' and np.min(oversampling) < 2:
-        msg = ("oversampling must be at least 2 with weighting='astrometric', "
+def _as_weighting(weighting, oversampling):
+    choice = as_choice(weighting, 'weighting',
+                       ('uniform', 'astrometric', 'photometric'))
+    if choice != 'uniform' and np.min(oversampling) < 2:
+        msg = (f'oversampling must be at least 2 with weighting={choice!r}, '
                f'got {oversampling}')
         raise ValueError(msg)
-    return choice == 'astrometric'
+    return choice
 
 
 def _as_origin(origin, shape):
@@ -372,8 +381,8 @@ def _fit_image(problem, spaces, image, weight, start):
     else:
         solution = run(stamp, problem, spaces,
                        stamp_shapes(start, problem, stamp.centre))
-    if problem.astrometric and solution.has_flux:
-        solution = refine_astrometry(stamp, problem, spaces, solution)
+    if problem.weighting != 'uniform' and solution.has_flux:
+        solution = refine_phases(stamp, problem, spaces, solution)
     if not solution.has_flux:
         return _failure(FitStatus.EMPTY, image)
     solution = narrow_first(solution)
@@ -458,6 +467,8 @@ def _report(problem, stamp, image, solution, equations):
     n = np.count_nonzero(used)
     weight = weight[used] * stamp.weight_unit
     chi2 = float((weight * residual[used] ** 2).sum())
+    if _is_noise((weight * image[used] ** 2).sum(), chi2, n, problem):
+        return _failure(FitStatus.NO_STAR, image)
     covariance = covariance_of(problem, stamp, solution, equations)
     if not problem.has_error:
         covariance *= chi2 / max(n - problem.n_parameters, 1)
@@ -466,6 +477,19 @@ def _report(problem, stamp, image, solution, equations):
         mixture, status, status.sentence, float(stamp.scale * total / area),
         chi2, _bic(chi2, n, problem), float(model[used].sum()), residual,
         covariance, used)
+
+
+def _is_noise(power, chi2, n, problem):
+    """
+    Return whether a model takes no more from n pixels than from noise.
+
+    Of white noise the best of all places and shapes takes about this many
+    times the variance, which is that of the residual: a negative star is
+    there, too.
+    """
+    p = problem.n_parameters
+    variance = chi2 / max(n - p, 1)
+    return power - chi2 < (2 * p + 4 * np.log(n)) * variance
 
 
 def _judge(solution, price):

@@ -11,13 +11,15 @@ projected, for many places of the star within a pixel, onto flux and position,
     D = F\,[P, -\partial_x P, -\partial_y P].
 
 A shift that is the same at all phases is a matter of definition; half the
-range over the phases is the error.
+range over the phases is the error. That of the flux is the scatter over the
+phases, see `photutils_mgauss.fitting.phases`.
 """
 import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
 from tqdm.auto import tqdm
 
 from photutils_mgauss.fitting.image import fit_mixture
+from photutils_mgauss.fitting.phases import FLUX_LIMIT, flux_phase_error
 from photutils_mgauss.psf.grid import plain_report
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.parallel import available_cores
@@ -74,6 +76,8 @@ def fit_nodes(nodes, n_components, *, radius=None, start='centre',
     for chunk in _chunks(len(images), progress_bar):
         fits += fit_mixture(images[chunk], n_components, mask=mask[chunk],
                             start=first, **options)
+    if first is not None and kwargs.get('weighting') == 'photometric':
+        fits = _refitted(fits, images, mask, nodes, n_components, options)
     report = _report(nodes, images, mask, fits, radius, executor)
     mixtures = [fit.mixture and fit.mixture.affine(nodes.unit * np.eye(2))
                 if nodes.unit != 1 else fit.mixture for fit in fits]
@@ -93,6 +97,26 @@ def _first_fit(images, mask, nodes, n_components, options, start):
         if fit.status.usable:
             return fit.mixture
     return None
+
+
+def _refitted(fits, images, mask, nodes, n_components, options):
+    """
+    Return the fits, those that miss the limit of the flux from own starts.
+
+    The start from another node may lead to another minimum.
+    """
+    errors = np.array([_flux_phase_error(nodes, fit, image)
+                       for fit, image in zip(fits, images, strict=True)])
+    poor = np.flatnonzero(errors > FLUX_LIMIT)
+    if not poor.size:
+        return fits
+    again = fit_mixture(images[poor], n_components, mask=mask[poor],
+                        **options)
+    better = list(fits)
+    for node, fit in zip(poor, again, strict=True):
+        if _flux_phase_error(nodes, fit, images[node]) < errors[node]:
+            better[node] = fit
+    return better
 
 
 def _chunks(n, progress_bar):
@@ -123,10 +147,23 @@ def _report(nodes, images, mask, fits, radius, executor):
     table['phase_error'] = [
         _phase_error(nodes, fit, min(radius, _PHASE_RADIUS / nodes.unit))
         for fit in fits]
+    table['flux_phase_error'] = [
+        _flux_phase_error(nodes, fit, image)
+        for fit, image in zip(fits, images, strict=True)]
     table['enclosed_flux'] = [fit.enclosed_flux for fit in fits]
     table['status'] = [int(fit.status) for fit in fits]
     table['message'] = [fit.message for fit in fits]
     return table
+
+
+def _flux_phase_error(nodes, fit, image):
+    """Return how much fluxes scatter over the pixel phases."""
+    if fit.mixture is None:
+        return np.nan
+    pitch = np.array(nodes.oversampling[::-1]) / nodes.unit
+    return flux_phase_error(fit.mixture.affine(nodes.unit * np.eye(2)),
+                            np.where(fit.used, image, image - fit.residual),
+                            pitch, np.array(nodes.centre))
 
 
 def _phase_error(nodes, fit, radius):

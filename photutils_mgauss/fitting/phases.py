@@ -12,6 +12,14 @@ SIZES = (5, 7)
 _MIN_PHASES = 4
 # A stamp with less of the star's light than this fraction tells nothing.
 _LEAST_LIGHT = 1e-3
+# Fluxes that change more than this with the pixel phase are said [rms].
+FLUX_LIMIT = 0.003
+# Fluxes are those in stamps of so many native pixels. The variance of a
+# bright star's pixels has a floor of this share of its peak.
+_FLUX_SIZE = 5
+_FLOOR = 0.01
+# Between the samples of an image, too, the flux is looked at.
+_FLUX_PHASES = 8
 
 
 def phase_rows(mixture, flux, shape, pitch, origin, used, sizes=SIZES):
@@ -41,21 +49,74 @@ def phase_rows(mixture, flux, shape, pitch, origin, used, sizes=SIZES):
         For n phases the errors of x and y [native pix] as sums over the
         residual.
     """
-    phases = [_phases_along(p) for p in pitch]
-    peak = origin + mixture.moments().mean * pitch
     return used * np.array([
-        _rows_of_size(mixture, flux, shape, pitch, origin, peak, size, *phases)
+        _rows_of_size(mixture, flux, shape, pitch, origin, size)[:, :2]
         for size in sizes])
 
 
-def _phases_along(pitch):
+def flux_rows(mixture, flux, shape, pitch, origin, used,
+              least_phases=_MIN_PHASES):
+    """
+    Return the map from residual images to relative errors of the flux.
+
+    Parameters
+    ----------
+    mixture, flux, shape, pitch, origin, used
+        See `phase_rows`.
+    least_phases : int, optional
+        The least number of phases along each axis.
+
+    Returns
+    -------
+    (2, n, ny, nx) `~numpy.ndarray`
+        For a faint star and a bright one at n phases the errors as sums over
+        the residual.
+    """
+    return used * np.array([
+        _rows_of_size(mixture, flux, shape, pitch, origin, _FLUX_SIZE,
+                      least_phases, bright)[:, 2] / flux
+        for bright in (False, True)])
+
+
+def flux_phase_error(mixture, image, pitch, origin):
+    """
+    Return how much the flux of a star changes with its pixel phase.
+
+    The fit of a model to itself gives its flux exactly, so that the fit of
+    the image itself, without a model subtracted that may hide between the
+    samples, gives the error.
+
+    Parameters
+    ----------
+    mixture, pitch, origin
+        See `phase_rows`.
+    image : (ny, nx) `~numpy.ndarray`
+        The PSF, with the model in pixels that do not count.
+
+    Returns
+    -------
+    float
+        The standard deviation over the phases, as a fraction of the flux; of
+        faint and bright stars the greater.
+    """
+    rows = flux_rows(mixture, 1.0, image.shape, pitch, origin, 1.0,
+                     least_phases=_FLUX_PHASES)
+    fluxes = np.tensordot(rows, image, 2)
+    return float((fluxes.std(axis=1) / fluxes.mean(axis=1)).max())
+
+
+def _phases_along(pitch, least):
     """Return phases within a native pixel, in image pixels (m,)."""
-    n = int(pitch) * max(1, -(-_MIN_PHASES // int(pitch)))
+    whole = max(int(pitch), 1)
+    n = whole * max(1, -(-least // whole))
     return np.arange(n) * pitch / n
 
 
-def _rows_of_size(mixture, flux, shape, pitch, origin, peak, size, x, y):
-    """Return rows (n, 2, ny, nx) for phases x (mx,) by y (my,)."""
+def _rows_of_size(mixture, flux, shape, pitch, origin, size,
+                  least_phases=_MIN_PHASES, bright=False):
+    """Return rows (n, 3, ny, nx) of x, y and flux for n phases."""
+    x, y = (_phases_along(p, least_phases) for p in pitch)
+    peak = origin + mixture.moments().mean * pitch
     columns = _positions(peak[0], pitch[0], x, size)
     lines = _positions(peak[1], pitch[1], y, size)
     u = (columns - origin[0])[None, :, None, :] / pitch[0]
@@ -64,12 +125,23 @@ def _rows_of_size(mixture, flux, shape, pitch, origin, peak, size, x, y):
     jacobian = np.stack([-flux * slope[..., 0], -flux * slope[..., 1], value],
                         axis=-1).reshape(len(y), len(x), size**2, 3)
     jacobian[value.sum(axis=(-2, -1)) < _LEAST_LIGHT] = 0
-    errors = np.linalg.pinv(jacobian)[:, :, :2]
-    errors = errors.reshape(len(y), len(x), 2, size, size)
+    if bright:
+        root = _root_of_weights(value).reshape(len(y), len(x), size**2)
+        errors = np.linalg.pinv(jacobian * root[..., None])
+        errors *= root[:, :, None]
+    else:
+        errors = np.linalg.pinv(jacobian)
+    errors = errors.reshape(len(y), len(x), 3, size, size)
     across = _interpolation(columns, shape[1])[None, :, None]
     down = _interpolation(lines, shape[0])[:, None, None]
     rows = np.swapaxes(down, -1, -2) @ (errors @ across)
-    return rows.reshape(-1, 2, *shape)
+    return rows.reshape(-1, 3, *shape)
+
+
+def _root_of_weights(value):
+    """Return the root of the weights of pixels where the light is noise."""
+    floor = _FLOOR * value.max()
+    return 1 / np.sqrt(np.maximum(value, 0) + floor)
 
 
 def _positions(peak, pitch, phases, size):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from photutils_mgauss import kernels
-from photutils_mgauss.fitting.phases import phase_rows
+from photutils_mgauss.fitting.phases import flux_rows, phase_rows
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.rows import log_rows
 
@@ -24,6 +24,10 @@ _MAX_STEPS = 500
 # A Gaussian narrower than this in stamp pixels falls between the pixel
 # centres and can take any flux.
 _MIN_STDDEV = 0.4
+# No Gaussian of a PSF that contains the pixel is much narrower than the pixel,
+# whose standard deviation is 0.29; others change their flux between phases
+# that samples show [native pix].
+_PIXEL_STDDEV = 0.25
 # A net flux below this fraction of what cancels in it is rounding error.
 _LEAST_FLUX = 1e-4
 # How firmly the total flux is tied and limits are kept, in units of the
@@ -31,13 +35,13 @@ _LEAST_FLUX = 1e-4
 _TIE = 1e6
 _STIFFNESS = 1.0
 # What a centroid error of one native pixel costs, in the same unit, rising so
-# that no step goes far. At each price the map to centroid errors follows the
-# solution so many times, each after so many steps, or until the cost changes
-# by less than this fraction.
-_ASTROMETRY = (1.0, 10.0, 100.0)
-_ASTROMETRY_ROUNDS = 8
-_ASTROMETRY_STEPS = 4
-_ASTROMETRY_TOLERANCE = 1e-2
+# that no step goes far, or an error of the flux by itself. At each price the
+# map to these errors follows the solution so many times, each after so many
+# steps, or until the cost changes by less than this fraction.
+_PRICES = {'astrometric': (1.0, 10.0, 100.0), 'photometric': (1.0,)}
+_PHASE_ROUNDS = 8
+_PHASE_STEPS = 4
+_PHASE_TOLERANCE = 1e-2
 # The steps every split gets, and the better half again: so many, and so many
 # more for each Gaussian; and the fraction of them, and the least number, that
 # go on at the end. With fewer Gaussians than asked for, trials are shorter and
@@ -59,13 +63,20 @@ class StampProblem(NamedTuple):
     tied: bool
     signed: bool
     fixed: bool
-    astrometric: bool
+    weighting: str
     has_error: bool
 
     @property
     def pitch(self):
         """Image pixels per native pixel along (x, y)."""
         return np.array(self.oversampling[::-1], float)
+
+    @property
+    def least_stddev(self):
+        """The least standard deviation of a Gaussian, in image pixels."""
+        if self.weighting != 'photometric':
+            return _MIN_STDDEV
+        return max(_MIN_STDDEV, _PIXEL_STDDEV * self.pitch.min())
 
     @property
     def n_parameters(self):
@@ -112,8 +123,8 @@ class Stamp(NamedTuple):
         total = pixels.sum()
         tie = (total, _TIE / total**2) if problem.tied else (0.0, 0.0)
         reach = _reach(used, centre)
-        limits = np.array([np.log(_MIN_STDDEV), np.log(reach.max()), *reach,
-                           _STIFFNESS])
+        limits = np.array([np.log(problem.least_stddev), np.log(reach.max()),
+                           *reach, _STIFFNESS])
         pixels = _widened(pixels)
         return cls(pixels, _widened(weight / weight_unit), centre, peak, tie,
                    np.empty((0, *pixels.shape)), limits, scale, weight_unit)
@@ -216,31 +227,31 @@ def search(stamp, problem, spaces):
     return best
 
 
-def refine_astrometry(stamp, problem, spaces, solution):
+def refine_phases(stamp, problem, spaces, solution):
     """
-    Return the solution refitted with centroid errors in its cost.
+    Return the solution refitted with pixel-phase errors in its cost.
 
-    The map from residuals to centroid errors changes with the model: a few
+    The map from residuals to these errors changes with the model: a few
     steps are taken with one map, then the next is made. Each solution is
     judged by its own map and the best is kept.
     """
     improving = False
-    for price in _ASTROMETRY:
+    for price in _PRICES[problem.weighting]:
         mapped, priced = _price(stamp, problem, spaces, solution, price)
         if not priced.has_flux:
             break
         solution = best = priced
         improving = False
-        for _ in range(_ASTROMETRY_ROUNDS):
+        for _ in range(_PHASE_ROUNDS):
             before = solution.cost
             trial = run(mapped, problem, spaces, solution.shapes,
-                        _ASTROMETRY_STEPS)
+                        _PHASE_STEPS)
             if not trial.has_flux:
                 break
             mapped, solution = _price(stamp, problem, spaces, trial, price)
             if not solution.has_flux:
                 break
-            small = _ASTROMETRY_TOLERANCE * best.cost
+            small = _PHASE_TOLERANCE * best.cost
             improving = solution.cost < best.cost - small
             best = min(best, solution, key=lambda each: each.cost)
             if abs(solution.cost - before) < small:
@@ -257,11 +268,12 @@ def _price(stamp, problem, spaces, solution, price):
 
 
 def _phase_rows(stamp, problem, solution):
-    """Return centroid errors of the kernels' residual as few rows."""
-    rows = phase_rows(mixture_of(solution, problem, stamp.centre),
-                      solution.fluxes.sum() / problem.pitch.prod(),
-                      stamp.pixels.shape, problem.pitch, problem.origin,
-                      stamp.weight > 0)
+    """Return pixel-phase errors of the kernels' residual as few rows."""
+    errors = flux_rows if problem.weighting == 'photometric' else phase_rows
+    rows = errors(mixture_of(solution, problem, stamp.centre),
+                  solution.fluxes.sum() / problem.pitch.prod(),
+                  stamp.pixels.shape, problem.pitch, problem.origin,
+                  stamp.weight > 0)
     rows = rows.reshape(-1, stamp.pixels.size)
     # The rows count by the sum of their squares alone, so rotated ones do.
     power, directions = np.linalg.eigh(rows @ rows.T)

@@ -90,6 +90,7 @@ def psf_arrays(model):
 def is_fixed_shape(model):
     """Return whether the kernels can fit all that is free in a model."""
     return (isinstance(model, PSFModel) and model.has_fixed_shape
+            and not model.has_tied
             and (model.interpolation, model.outside) == ('blend', 'clamp'))
 
 

@@ -17,6 +17,7 @@ from astropy.table import QTable
 
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.shapes import adaptive_moments
+from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.validation import as_shape
 
 __all__ = ['PSFAssessment', 'assess_psf']
@@ -26,7 +27,7 @@ _FINE, _REACH = 4, 8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PSFAssessment:
+class PSFAssessment(ComparedByValue):
     r"""
     Errors of a PSF model at places on a detector.
 

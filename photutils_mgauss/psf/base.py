@@ -18,8 +18,30 @@ PARAMETER_COLUMNS = dict.fromkeys(
     ('name', 'value', 'unit', 'fixed', 'lower', 'upper'), '')
 
 
+# Steps of numerical derivatives of ties, relative to the parameter or 1.
+_TIE_STEP = 6e-6
+
+
 class PSFParameter(Parameter):
-    """A Parameter that is cheap to copy."""
+    """A Parameter that is cheap to copy and checks what a user sets."""
+
+    # Asked for before astropy's constructor has set it.
+    _validator = None
+
+    @property
+    def value(self):
+        """The number, without unit."""
+        return super().value
+
+    @value.setter
+    def value(self, value):
+        if self._validator is not None:
+            self._validator(self._model, value)
+        Parameter.value.fset(self, value)
+
+    def step_to(self, value):
+        """Take a value that need not be checked, as from a fit."""
+        self._value = np.array(value, dtype=np.float64)
 
     def bound_copy(self, model):
         """Return a copy that belongs to ``model``, at a tenth of deepcopy."""
@@ -88,6 +110,49 @@ class PSFModel(Fittable2DModel):
         dx, dy = self._half_size()
         x_0, y_0 = self.x_0, self.y_0
         return ((y_0 - dy, y_0 + dy), (x_0 - dx, x_0 + dx))
+
+    def _array_to_parameters(self):
+        # Fits come here with every step, and may step anywhere.
+        for name in self.param_names:
+            metrics = self._param_metrics[name]
+            getattr(self, name).step_to(np.reshape(
+                self._parameters[metrics['slice']], metrics['shape']))
+
+    def _along_ties(self, columns, values):
+        """
+        Return derivatives that follow the parameters' ties.
+
+        A free parameter carries along those that are tied to it, which
+        astropy's fitters leave out: what they move is the sum of the columns
+        times the derivatives of the ties.
+        """
+        if not self.has_tied:
+            return columns
+        values = np.array([float(np.squeeze(v)) for v in values])
+        free = [i for i, name in enumerate(self.param_names)
+                if not (self.fixed[name] or self.tied[name])]
+        probe = self.copy()
+        followed = list(columns)
+        for i in free:
+            step = np.zeros(values.size)
+            step[i] = _TIE_STEP * max(1, abs(values[i]))
+            slope = (probe._tied_values(values + step)
+                     - probe._tied_values(values - step)) / (2 * step[i])
+            slope[i] = 0
+            followed[i] = columns[i] + sum(slope[j] * columns[j]
+                                           for j in np.flatnonzero(slope))
+        return followed
+
+    def _tied_values(self, values):
+        """Return all parameters after those that are tied were moved."""
+        self.parameters = values
+        moved = values.copy()
+        for i, name in enumerate(self.param_names):
+            if self.tied[name]:
+                moved[i] = float(np.squeeze(self.tied[name](self)))
+                # A later tie may use an earlier one.
+                getattr(self, name).step_to(moved[i])
+        return moved
 
     def copy(self):
         """

@@ -336,6 +336,7 @@ def plain_report(positions, n_components, scales):
         'y': positions[:, 1].astype(float),
         'n_components': np.array(n_components, int), 'scale': scales,
         'chi2': nan, 'size_error': nan, 'ellipticity_error': nan, 'e1': nan,
-        'e2': nan, 'phase_error': nan, 'enclosed_flux': nan,
+        'e2': nan, 'phase_error': nan, 'flux_phase_error': nan,
+        'enclosed_flux': nan,
         'bridged': np.zeros(n, bool), 'status': np.full(n, -1),
         'message': np.full(n, 'The mixture was given, not fitted.')})

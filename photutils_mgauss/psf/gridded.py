@@ -159,7 +159,10 @@ n_components=1)>
         ``chi2`` of the fit; ``size_error`` and ``ellipticity_error``, the
         dR^2/R^2 and d-epsilon of Eq. 8 by adaptive moments, and ``e1``,
         ``e2`` of the image; ``phase_error``, half the range of the shift
-        with pixel phase that the residual causes [pix]; ``enclosed_flux``;
+        with pixel phase that the residual causes [pix];
+        ``flux_phase_error``, the standard deviation over the pixel phases of
+        a flux fitted in 5 x 5 pixels, as a fraction of it, that of faint or
+        of bright stars, whichever is greater; ``enclosed_flux``;
         ``bridged``, whether the node was filled from its neighbours;
         ``status`` and ``message`` of the fit, -1 for mixtures not fitted.
         """
@@ -278,7 +281,8 @@ n_components=1)>
         Returns
         -------
         list of `~numpy.ndarray`
-            One array of the shape of x for each parameter.
+            One array of the shape of x for each parameter, with what is tied
+            to it.
         """
         flux = float(np.squeeze(split_flux(flux)[0]))
         (x, y), shape = flat_points(x, y)
@@ -287,7 +291,8 @@ n_components=1)>
         self._run(1, x, y, x_0, y_0, out=out)
         self._mark_outside(x_0, y_0, out)
         out[1:] *= flux
-        return list(out.reshape(3, *shape))
+        return self._along_ties(list(out.reshape(3, *shape)),
+                                (flux, x_0, y_0))
 
     def mixture_at(self, x, y):
         """

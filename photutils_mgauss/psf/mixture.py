@@ -15,6 +15,7 @@ from photutils_mgauss import kernels
 from photutils_mgauss.files.storage import storable
 from photutils_mgauss.psf.integrals import polar_integral
 from photutils_mgauss.psf.rows import kernel_rows, matrices
+from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.validation import (
     as_floats,
     as_real,
@@ -34,7 +35,7 @@ class Moments(NamedTuple):
 
 @storable(components={'weight': '', 'mean': 'pix', 'covariance': 'pix2'})
 @dataclass(frozen=True, eq=False, repr=False)
-class GaussianMixture:
+class GaussianMixture(ComparedByValue):
     r"""
     A unit-flux sum of K correlated Gaussians, centred on the star.
 
@@ -50,6 +51,7 @@ class GaussianMixture:
     :math:`\Sigma_{yy} = \beta_y^2`.
 
     The mixture copies its input and never changes: a new PSF is a new object.
+    Two mixtures are equal if all their numbers are, in the same order.
 
     Parameters
     ----------
@@ -117,7 +119,7 @@ class GaussianMixture:
                    columns['covariance'].reshape(n, 2, 2))
 
     @classmethod
-    def from_stddevs(cls, weights, means, stddevs, rho):
+    def from_stddevs(cls, weights, means, stddevs, rho=0):
         """
         Make a mixture from standard deviations and correlations.
 
@@ -129,8 +131,9 @@ class GaussianMixture:
             The centres (x, y) relative to the star [pix].
         stddevs : (K, 2) array_like
             The standard deviations along x and y [pix], positive.
-        rho : (K,) array_like
-            The correlation coefficients, in (-1, 1).
+        rho : float or (K,) array_like, optional
+            The correlation coefficients, in (-1, 1); one number stands for
+            all.
 
         Returns
         -------
@@ -151,7 +154,8 @@ class GaussianMixture:
                [1., 4.]])
         """
         stddevs = as_floats(stddevs, 'stddevs', shape=(None, 2))
-        rho = as_floats(rho, 'rho', shape=(len(stddevs),))
+        rho = as_floats(np.full(len(stddevs), rho) if np.ndim(rho) == 0
+                        else rho, 'rho', shape=(len(stddevs),))
         if not (stddevs > 0).all():
             msg = f'stddevs must be positive, got {stddevs.min()}'
             raise ValueError(msg)

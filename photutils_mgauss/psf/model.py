@@ -8,7 +8,11 @@ The weights of K Gaussians are held as K - 1 stick-breaking fractions
 
     \omega_k = f_k \prod_{j<k} (1 - f_j), \qquad f_K = 1 .
 """
+import warnings
+from functools import partial
+
 import numpy as np
+from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss import kernels
 from photutils_mgauss.files.storage import storable
@@ -29,7 +33,8 @@ from photutils_mgauss.utils.validation import as_integer
 
 __all__ = ['MultiGaussianPSFModel']
 
-# Fits may step anywhere; beyond these limits shapes stay at the limit.
+# Fits may step anywhere; beyond these limits shapes stay at the limit. What a
+# user sets is refused there.
 _MIN_STDDEV = 1e-3
 _MAX_RHO = 1 - 1e-9
 
@@ -108,12 +113,14 @@ class MultiGaussianPSFModel(PSFModel):
         values = _shape_values(mixture)
         self.param_names = ('flux', 'x_0', 'y_0', *values)
         self._n_components = mixture.n_components
+        self._stepped = False
         self._pixel_integrated = bool(pixel_integrated)
         signed = (mixture.weights < 0).any()
         for name, value in values.items():
             parameter = PSFParameter(name, default=value, fixed=True,
                                      bounds=_shape_bounds(name, signed))
             parameter.model = self
+            parameter._validator = partial(_check_shape, name, signed)
             self.__dict__[name] = parameter
         super().__init__(flux=flux, x_0=x_0, y_0=y_0, **kwargs)
         self._finish()
@@ -150,6 +157,46 @@ class MultiGaussianPSFModel(PSFModel):
     def grid(self):
         """The mixture as a grid of one node, see ``PSFModel``."""
         return Grid.of_mixture(self.mixture)
+
+    def __call__(self, x, y, **kwargs):
+        """
+        Evaluate the model at pixel positions x and y.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Pixel positions; they broadcast.
+        **kwargs
+            Keywords of astropy's models, such as ``with_bounding_box``.
+
+        Returns
+        -------
+        `~numpy.ndarray`
+            The model, in the unit of ``flux``.
+        """
+        # A fit without bounds, or an assignment to all parameters at once,
+        # may have left the range that single parameters are held to.
+        if self._stepped:
+            self._warn_of_range()
+        return super().__call__(x, y, **kwargs)
+
+    def _array_to_parameters(self):
+        super()._array_to_parameters()
+        self._stepped = True
+
+    def _warn_of_range(self):
+        """Warn of the first parameter whose value no Gaussian has."""
+        self._stepped = False
+        signed = self.bounds.get('fraction_1') == (None, None)
+        for name in self.param_names[3:]:
+            value = getattr(self, name).value
+            reason = _fault(name, signed, np.asarray(value))
+            if reason:
+                warnings.warn(
+                    f'{name} is {value:g} and must be {reason}; the nearest '
+                    'valid shape is drawn. Give the fit bounds',
+                    AstropyUserWarning, stacklevel=3)
+                return
 
     def free_shape(self):
         """
@@ -243,10 +290,13 @@ class MultiGaussianPSFModel(PSFModel):
         Returns
         -------
         list of `~numpy.ndarray`
-            One array of the shape of x for each parameter. Those of fixed
-            parameters, which no fit uses, are zero and not computed.
+            One array of the shape of x for each parameter, with what is tied
+            to it. Those of fixed parameters, which no fit uses, are zero and
+            not computed.
         """
-        free = [not getattr(self, name).fixed for name in self.param_names]
+        free = [bool(not parameter.fixed or parameter.tied) for parameter in
+                (getattr(self, name) for name in self.param_names)]
+        values = flux, x_0, y_0, *shape
         flux = float(np.squeeze(split_flux(flux)[0]))
         dx = np.asarray(x, float) - np.squeeze(x_0)
         dy = np.asarray(y, float) - np.squeeze(y_0)
@@ -258,8 +308,9 @@ class MultiGaussianPSFModel(PSFModel):
                                                  _rows_of(shape))
         zero = np.zeros(lattice)
         columns += [zero] * (len(free) - len(columns))
-        return [column.reshape(lattice) if is_free else zero
-                for column, is_free in zip(columns, free, strict=True)]
+        columns = [column.reshape(lattice) if is_free else zero
+                   for column, is_free in zip(columns, free, strict=True)]
+        return self._along_ties(columns, values)
 
     def _position_derivatives(self, dx, dy, flux, rows):
         out = np.empty((3, dx.size))
@@ -406,6 +457,29 @@ def _fractions(weights):
                f'Gaussian, got {weights.tolist()}; put negative ones first')
         raise ValueError(msg)
     return np.where(empty, 0.5, weights[:-1] / np.where(empty, 1, rest))
+
+
+def _check_shape(name, signed, _, value):
+    """Raise if the parameter of a shape has a value that no Gaussian has."""
+    reason = _fault(name, signed, np.asarray(value, float))
+    if reason:
+        msg = f'{name} must be {reason}, got {value}'
+        raise ValueError(msg)
+
+
+def _fault(name, signed, value):
+    """Return what a value of the shape should be if it is not, or None."""
+    kind = name.rpartition('_')[0]
+    if kind == 'rho' and not (np.abs(value) < 1).all():
+        return 'a correlation inside (-1, 1)'
+    if kind.endswith('stddev') and not ((value > 0)
+                                        & np.isfinite(value)).all():
+        return 'a standard deviation, positive and finite'
+    if kind == 'fraction' and not signed and not ((value >= 0)
+                                                  & (value <= 1)).all():
+        return ('a fraction in [0, 1] (negative weights come with a mixture '
+                'that has them)')
+    return None if np.isfinite(value).all() else 'finite'
 
 
 def _shape_bounds(name, signed):

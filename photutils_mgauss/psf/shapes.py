@@ -15,6 +15,7 @@ import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.mixture import GaussianMixture
+from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.image import check_errors, read_stack, with_unit
 from photutils_mgauss.utils.parallel import map_chunks
 from photutils_mgauss.utils.validation import as_floats, as_shape
@@ -65,7 +66,7 @@ _SENTENCES = {
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
+class Shapes(ComparedByValue):
     """
     Adaptive moments of one image or mixture, or of n.
 

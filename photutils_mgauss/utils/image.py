@@ -8,6 +8,7 @@ result; `~astropy.nddata.NDData` with its mask, its unit and an uncertainty of
 any kind. Nothing that a user gives is changed, and an image is copied only
 where the call would have to copy it anyway.
 """
+import warnings
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -15,6 +16,7 @@ import astropy.units as u
 import numpy as np
 from astropy.nddata import NDData, StdDevUncertainty
 from astropy.stats import mad_std
+from astropy.utils.exceptions import AstropyUserWarning
 from astropy.utils.masked import Masked
 
 from photutils_mgauss.utils.validation import as_real
@@ -22,6 +24,10 @@ from photutils_mgauss.utils.validation import as_real
 # Statistics of larger images are those of evenly spaced rows.
 _SAMPLE = 1 << 23
 _GAIN_SAMPLE = 1 << 18
+# A row of this many equal pixels and one more is no accident; if that is so
+# for this share of the pixels, something is wrong with the image.
+_PADDING_RUN, _PADDING_SHARE, _PADDING_SAMPLE = 15, 0.03, 1 << 18
+_BLOCK = 1 << 20
 # How much the variance may scatter about a line in the data, as a fraction of
 # the scatter of an expected variance, to be made from these very data.
 _OWN_VARIANCE = 0.3
@@ -107,9 +113,19 @@ def read_pixels(data, error=None, mask=None, *, name='data', broadcast=False):
     Raises
     ------
     TypeError, ValueError
-        If an argument is not valid.
+        If an argument is not valid, or no pixel can be used: all are masked,
+        not finite, or have an error that is not positive and finite.
+
+    Warns
+    -----
+    AstropyUserWarning
+        If a large part of the image holds one value only beside pixels with
+        noise or a sky, as mosaics have it where there is no data.
     """
-    return _read(data, error, mask, name, (2,), broadcast)
+    pixels = _read(data, error, mask, name, (2,), broadcast)
+    _check_usable(pixels, name)
+    _warn_of_padding(pixels, name)
+    return pixels
 
 
 def read_stack(data, error=None, mask=None, *, name='image'):
@@ -353,6 +369,79 @@ def _factor(own, unit, name, data_name):
     except u.UnitConversionError as reason:
         msg = f'{name} must have a unit like {unit}, got {own}'
         raise ValueError(msg) from reason
+
+
+# Images that cannot be what the user believes.
+
+def _check_usable(pixels, name):
+    """Raise if not a single pixel can be used."""
+    step = max(1, _BLOCK // pixels.shape[1])
+    for first in range(0, pixels.shape[0], step):
+        rows = np.s_[first:first + step]
+        good = np.isfinite(pixels.data[rows])
+        if pixels.error is not None:
+            error = pixels.error[rows]
+            good &= np.isfinite(error) & (error > 0)
+        if pixels.mask is not None:
+            good &= ~pixels.mask[rows]
+        if good.any():
+            return
+    if pixels.mask is not None and pixels.mask.all():
+        why = 'all are masked'
+    elif not np.isfinite(pixels.data).any():
+        why = 'all are NaN or infinite'
+    else:
+        why = ('all are masked or not finite, or have an error that is not '
+               'positive and finite')
+    msg = f'{name} must have pixels that can be used, got none: {why}'
+    raise ValueError(msg)
+
+
+def _warn_of_padding(pixels, name):
+    """Warn if much of the image has one value, and not the rest."""
+    rows = _spaced(pixels.shape, _PADDING_SAMPLE)
+    data = np.array(pixels.data[rows], float)
+    if pixels.mask is not None:
+        data[pixels.mask[rows]] = np.nan
+    if pixels.error is not None:
+        error = pixels.error[rows]
+        data[~(np.isfinite(error) & (error > 0))] = np.nan
+    constant = _in_runs(data)
+    share = np.count_nonzero(constant) / data.size
+    if share < _PADDING_SHARE:
+        return
+    value = np.median(data[constant])
+    rest = data[np.isfinite(data) & (data != value)]
+    if rest.size and _has_sky(rest - value):
+        warnings.warn(
+            f'{100 * share:.0f} % of the pixels of {name} have exactly the '
+            f'value {value:g}, beside others with a sky or noise: give a mask '
+            'of pixels without data', AstropyUserWarning, stacklevel=4)
+
+
+def _in_runs(data):
+    """Return which pixels are in long runs of equal pixels along rows."""
+    length = _PADDING_RUN
+    constant = np.zeros(data.shape, bool)
+    if data.shape[1] <= length:
+        return constant
+    same = np.cumsum(np.diff(data, axis=1) == 0, axis=1)
+    same = np.pad(same, ((0, 0), (1, 0)))
+    whole = same[:, length:] - same[:, :-length] == length
+    for i in range(length + 1):
+        constant[:, i:i + whole.shape[1]] |= whole
+    return constant
+
+
+def _has_sky(above):
+    """
+    Return whether pixels other than a constant are more than clean wings.
+
+    Light of stars without noise and sky falls towards the constant and stays
+    on one side of it.
+    """
+    low, middle = np.quantile(above, [0.05, 0.5])
+    return low < 0 < middle or middle < 0 or low > 0.1 * middle
 
 
 # What an image says of its noise.
