@@ -10,7 +10,7 @@ from photutils_mgauss.crowded.table import no_stars, tabulate
 from photutils_mgauss.crowded.tile import CELL, TileJob, TileOptions
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.image import PixelData
-from photutils_mgauss.utils.parallel import available_cores
+from photutils_mgauss.utils.parallel import Threads, tell
 
 # The smallest and the largest size of tiles if none is given [pix].
 _TILES = (1024, 2048)
@@ -127,9 +127,9 @@ def run(plan, executor, progress_bar):
     errors : list of Exception
     """
     if executor is None:
-        with ThreadPoolExecutor(available_cores()) as pool:
+        with Threads() as pool:
             return run(plan, pool, progress_bar)
-    if isinstance(executor, ThreadPoolExecutor):
+    if isinstance(executor, (Threads, ThreadPoolExecutor)):
         return _collect(executor, plan.work, plan.cores, progress_bar)
     # Other workers may be elsewhere: they get no more than their tile.
     return _collect(executor, Outcome.of, map(plan.job, plan.cores),
@@ -145,11 +145,12 @@ def _collect(pool, work, tasks, progress_bar):
             errors.append(error)
         outcomes.append(None)
     bar = _bar(len(outcomes)) if progress_bar else None
-    for future in as_completed(futures):
+    for done, future in enumerate(as_completed(futures), 1):
         try:
             outcomes[futures[future]] = future.result()
         except Exception as error:  # noqa: BLE001 a worker may die of any
             errors.append(error)
+        tell(done, len(outcomes))
         if bar is not None:
             _advance(bar, outcomes)
     if bar is not None:

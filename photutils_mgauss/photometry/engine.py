@@ -270,5 +270,6 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     chunks = list(stars.chunks())
     watch = partial(tqdm, desc='Fitting stars', total=len(chunks),
                     disable=not progress_bar)
-    with closing(map_parallel(work, chunks, executor=executor)) as fits:
+    with closing(map_parallel(work, chunks, executor=executor,
+                              long=True)) as fits:
         return Fits.joined(list(watch(fits)))
