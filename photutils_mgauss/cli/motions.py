@@ -4,6 +4,7 @@ from pathlib import Path
 
 from photutils_mgauss.cli import photometry, tools
 from photutils_mgauss.cli import psf as psf_command
+from photutils_mgauss.cli.progress import Progress
 
 _TABLE_SUFFIXES = ('.ecsv', '.csv', '.txt', '.dat', '.vot', '.xml', '.votable')
 
@@ -32,7 +33,7 @@ def add(commands):
     psf_command.add_fit(parser)
     photometry.add_measuring(parser)
     tools.add_reading(parser)
-    tools.add_common(parser)
+    tools.add_overwrite(parser)
     parser.set_defaults(grid_shape=[30, 30])
 
 
@@ -61,9 +62,9 @@ def _add_solution(parser):
     group.add_argument('--match-radius', type=tools.positive, metavar='MAS',
                        help='largest distance of a match (default: from the '
                             'errors)')
-    group.add_argument('--good-flags', type=int, default=0, metavar='BITS',
-                       help='sum of the flags of detections to be used all '
-                            'the same')
+    group.add_argument('--good-flags', type=tools.not_negative,
+                       default=0, metavar='BITS', help='sum of the flags of '
+                       'detections to be used all the same')
     group.add_argument('--plane', action='store_true',
                        help='take pixels for coordinates, without WCS')
 
@@ -75,11 +76,21 @@ def run(options):
     folder = Path(options.output)
     are_tables = [is_table(path) for path in paths]
     names = _Names(folder, paths, are_tables, options.format)
-    tools.claim(names.all(), options.overwrite)
-    with tools.Progress(len(paths) + 2, options.quiet) as step:
-        epochs = _epochs(options, paths, are_tables, names, step)
+    read = tools.read_images(options, paths)
+    fitter = _fitter(options)
+    tools.claim(names.all(), options.overwrite, paths)
+    with Progress(1 + len(paths) + 2, options) as step:
+        step('look at all files')
+        epochs = [_from_catalogue(options, i) if are_tables[i]
+                  else _check_image(options, read(i))
+                  for i in range(len(paths))]
+        for i, path in enumerate(paths):
+            step(f'measure {path}' if epochs[i] is None else f'use {path}')
+            if epochs[i] is None:
+                epochs[i] = _from_image(options, read(i), names, i)
+            tools.say(options, f'{path}: {epochs[i]!r}')
         step('align and fit')
-        solution = _fit(epochs, options)
+        solution = fitter.fit(epochs)
         step(f'write to {folder}')
         _write(solution, names, options)
     tools.say(options, *_summary(solution), f'files are in {folder}')
@@ -87,7 +98,8 @@ def run(options):
 
 def _check(options):
     """Raise for what is wrong before anything is read."""
-    tools.check_inputs([*options.inputs, *filter(None, [options.references])])
+    tools.check_inputs([*options.inputs, options.references, options.stars])
+    tools.check_different(options.inputs)
     if len(options.inputs) < 2:
         msg = (f'inputs must be at least 2 exposures, got only '
                f'{options.inputs[0]}')
@@ -105,7 +117,7 @@ def is_table(path):
     from photutils_mgauss.files.image_layers import is_asdf, open_fits
     if is_asdf(path):
         return False
-    with open_fits(path) as hdus:
+    with tools.about(path), open_fits(path) as hdus:
         images = [hdu for hdu in hdus if hdu.is_image
                   and hdu.header.get('NAXIS', 0) >= 2]
         return not images and len(hdus) > 1
@@ -137,25 +149,17 @@ def _where(chosen, names):
             for yes, name in zip(chosen, names, strict=True)]
 
 
-def _epochs(options, paths, are_tables, names, step):
-    read = tools.read_images(options, paths)
-    epochs = []
-    for i, path in enumerate(paths):
-        step(f'read {path}' if are_tables[i] else f'measure {path}')
-        if are_tables[i]:
-            epochs.append(_from_catalogue(options, i))
-        else:
-            epochs.append(_from_image(options, read(i), names, i))
-        tools.say(options, f'{path}: {epochs[-1]!r}')
-    return epochs
-
-
-def _from_image(options, image, names, i):
-    """Return the epoch of an image; write its PSF and catalogue."""
+def _check_image(options, image):
+    """Raise if an image cannot become an epoch."""
+    psf_command.check_image(image)
     if image.wcs is None and not options.plane:
         raise ValueError(_no_sky(image.path))
     if image.time is None:
         raise ValueError(_no_time(image.path))
+
+
+def _from_image(options, image, names, i):
+    """Return the epoch of an image; write its PSF and catalogue."""
     psf, found = psf_command.from_stars(image, options)
     psf_command.write(psf, names.psfs[i], tools.record_of(
         options, input=str(image.path), **found))
@@ -168,6 +172,11 @@ def _from_image(options, image, names, i):
 
 def _from_catalogue(options, i):
     path = options.inputs[i]
+    with tools.about(path):
+        return _epoch_of_catalogue(options, path, i)
+
+
+def _epoch_of_catalogue(options, path, i):
     table, record = tools.read_table(path)
     exposure = record.get('exposure', {})
     time = tools.parse_time(tools.one_each(options.time, len(options.inputs),
@@ -207,11 +216,8 @@ def _epoch(options, path, table, wcs, time):
     wcs = None if options.plane else wcs
     if wcs is None and not options.plane:
         table = _on_the_sky(path, table)
-    try:
+    with tools.about(path):
         return Epoch(table, wcs, time, observer=options.observer)
-    except (TypeError, ValueError) as error:
-        msg = f'{path}: {error}'
-        raise ValueError(msg) from error
 
 
 def _usable(table, good_flags):
@@ -244,17 +250,16 @@ def _no_time(path):
     return f'{path}: the time must be known; its header has none, give --time'
 
 
-def _fit(epochs, options):
+def _fitter(options):
     import astropy.units as u
 
     from photutils_mgauss.motions import ProperMotionFitter
     radius = options.match_radius
-    fitter = ProperMotionFitter(
+    return ProperMotionFitter(
         transform=options.transform, recipe=options.recipe,
         parallax=options.parallax, references=_references(options),
         max_motion=options.max_motion * u.mas / u.yr,
         match_radius=None if radius is None else radius * u.mas)
-    return fitter.fit(epochs)
 
 
 def _references(options):

@@ -2,7 +2,9 @@
 import os
 from pathlib import Path
 
+from photutils_mgauss.cli import psf as psf_command
 from photutils_mgauss.cli import tools
+from photutils_mgauss.cli.progress import Progress
 
 _SUFFIXES = ('.ecsv', '.fits')
 
@@ -29,7 +31,7 @@ def add(commands):
     add_measuring(parser)
     tools.add_times(parser)
     tools.add_reading(parser)
-    tools.add_common(parser)
+    tools.add_overwrite(parser)
 
 
 def add_measuring(parser):
@@ -49,21 +51,25 @@ def run(options):
     """Measure the images."""
     paths = options.inputs
     tools.check_inputs([*paths, *options.psf])
+    tools.check_different(paths)
     names = tools.output_names(paths, options.output, '_cat', _SUFFIXES,
                                '.ecsv')
-    psfs = tools.one_each(options.psf, len(paths), 'psf')
-    tools.claim(names, options.overwrite)
+    owners = tools.one_each(options.psf, len(paths), 'psf')
     read = tools.read_images(options, paths)
-    with tools.Progress(3 * len(names), options.quiet) as step:
+    tools.claim(names, options.overwrite, [*paths, *options.psf])
+    with Progress(1 + 2 * len(names), options) as step:
+        step('look at all files')
+        psfs = {path: _read_psf(path) for path in dict.fromkeys(owners)}
+        for i in range(len(paths)):
+            psf_command.check_image(read(i))
         for i, name in enumerate(names):
             step(f'read {paths[i]}')
-            image, psf = read(i), _read_psf(psfs[i])
+            image = read(i)
             tools.say(options, image.describe())
             step(f'measure {paths[i]}')
-            table = measure(image, psf, options)
-            step(f'write {name}')
+            table = measure(image, psfs[owners[i]], options)
             record = tools.record_of(options, exposure=exposure(image, name),
-                                     psf=str(psfs[i]),
+                                     psf=str(owners[i]),
                                      reading=image.layers.sources)
             tools.write_table(table, name, record)
             tools.say(options, f'{name}: {len(table)} stars')
@@ -71,21 +77,19 @@ def run(options):
 
 def _read_psf(path):
     from photutils_mgauss.cli.psf_files import read_psf
-    return read_psf(path)
+    with tools.about(path):
+        return read_psf(path)
 
 
 def measure(image, psf, options):
     """Return the catalogue of an image."""
-    try:
+    with tools.about(image.path):
         table = (_crowded if options.crowded else _sparse)(image, psf,
                                                            options)
-    except ValueError as error:
-        msg = f'{image.path}: {error}'
-        raise ValueError(msg) from error
-    if table is None or len(table) == 0:
-        msg = f'{image.path}: must show a star, got none; try --threshold'
-        raise ValueError(msg)
-    return _with_sky(_with_unit(table, image.unit), image)
+        if table is None or len(table) == 0:
+            msg = 'must show a star, got none; try --threshold'
+            raise ValueError(msg)
+        return _with_sky(_with_unit(table, image.unit), image)
 
 
 def _sparse(image, psf, options):

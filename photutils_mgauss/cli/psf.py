@@ -1,5 +1,6 @@
 """``mgauss psf``: images or PSF files to grids of mixtures."""
 from photutils_mgauss.cli import tools
+from photutils_mgauss.cli.progress import Progress
 
 _SUFFIXES = ('.fits', '.asdf')
 
@@ -25,7 +26,7 @@ def add(commands):
     add_fit(parser)
     _add_files(parser)
     tools.add_reading(parser)
-    tools.add_common(parser)
+    tools.add_overwrite(parser)
 
 
 def add_fit(parser):
@@ -52,7 +53,7 @@ def add_fit(parser):
 
 def _add_files(parser):
     group = parser.add_argument_group('PSF files')
-    group.add_argument('--detector', type=int, metavar='NUMBER',
+    group.add_argument('--detector', type=tools.count, metavar='NUMBER',
                        help='detector of an STDPSF file')
     group.add_argument('--oversampling', type=tools.count, metavar='N',
                        help='of an ePSF image without OVERSAMP')
@@ -60,28 +61,53 @@ def _add_files(parser):
 
 def run(options):
     """Make the PSFs."""
-    tools.check_inputs(options.inputs)
-    names = tools.output_names(options.inputs, options.output, '_psf',
-                               _SUFFIXES, '.fits')
-    tools.claim(names, options.overwrite)
-    read = tools.read_images(options, options.inputs)
-    with tools.Progress(2 * len(names), options.quiet) as step:
-        for i, (path, name) in enumerate(zip(options.inputs, names,
-                                             strict=True)):
-            psf, found = _make(options, path, lambda i=i: read(i), step)
+    paths = options.inputs
+    tools.check_inputs([*paths, options.stars])
+    tools.check_different(paths)
+    names = tools.output_names(paths, options.output, '_psf', _SUFFIXES,
+                               '.fits')
+    read = tools.read_images(options, paths)
+    tools.claim(names, options.overwrite, paths)
+    with Progress(1 + 2 * len(names), options) as step:
+        step('look at all files')
+        kinds = [_kind(options, path, lambda i=i: read(i))
+                 for i, path in enumerate(paths)]
+        for i, (path, name) in enumerate(zip(paths, names, strict=True)):
+            step(f'read {path}')
+            psf, found = _make(options, path, kinds[i], lambda i=i: read(i),
+                               step)
             write(psf, name, tools.record_of(options, input=path, **found))
             tools.say(options, f'{name}: {_describe(psf, found)}')
 
 
-def _make(options, path, read, step):
-    """Return the grid of one input, and what is to be said of it."""
+def _kind(options, path, read):
+    """Return what an input is; raise if it is nothing to make a PSF of."""
     from photutils_mgauss.cli.psf_files import psf_kind
-    step(f'read {path}')
-    kind = psf_kind(path)
-    if kind == 'image' and options.oversampling is None:
+    with tools.about(path):
+        kind = psf_kind(path)
+    if kind != 'image':
+        if options.n_components == 'auto':
+            msg = f'{path}: --n-components must be a number for PSF files'
+            raise ValueError(msg)
+        return kind
+    if options.oversampling is not None:
+        return 'epsf'
+    check_image(read())
+    return kind
+
+
+def check_image(image):
+    """Raise if an image cannot be measured, and before any is."""
+    with tools.about(image.path):
+        image.check()
+
+
+def _make(options, path, kind, read, step):
+    """Return the grid of one input, and what is to be said of it."""
+    if kind == 'image':
         image = read()
         tools.say(options, image.describe())
-        step('PSF from stars')
+        step(f'PSF of {path}')
         return from_stars(image, options)
     step(f'fit {path}')
     return from_file(path, options), {'kind': kind}
@@ -91,18 +117,20 @@ def from_file(path, options):
     """Return the grid a PSF file becomes."""
     from photutils_mgauss.cli.psf_files import read_psf
     number = options.n_components
-    if number == 'auto':
-        msg = f'{path}: --n-components must be a number for PSF files'
-        raise ValueError(msg)
-    return read_psf(path, n_components=3 if number is None else number,
-                    grid_shape=tuple(options.grid_shape),
-                    radius=options.radius, detector=options.detector,
-                    oversampling=options.oversampling,
-                    progress_bar=not options.quiet)
+    with tools.about(path):
+        return read_psf(path, n_components=3 if number is None else number,
+                        grid_shape=tuple(options.grid_shape),
+                        radius=options.radius, detector=options.detector,
+                        oversampling=options.oversampling)
 
 
 def from_stars(image, options):
     """Return the grid of an image's own stars, and facts about it."""
+    with tools.about(image.path):
+        return _from_stars(image, options)
+
+
+def _from_stars(image, options):
     from photutils_mgauss.field.fit import fit_mixture_field
     given = {name: getattr(options, name)
              for name in ('n_components', 'degree', 'radius')}
@@ -131,14 +159,10 @@ def _choose(image, radius, options):
     if saturation is not None:
         # The level is that of the image with its sky.
         saturation -= float(image.sky.background_median)
-    try:
-        stars = select_psf_stars(
-            image.without_sky, sources, error=image.noise.total,
-            mask=image.mask, radius=radius, saturation=saturation,
-            min_snr=options.min_snr, max_stars=options.max_stars)
-    except ValueError as error:
-        msg = f'{image.path}: {error}'
-        raise ValueError(msg) from error
+    stars = select_psf_stars(
+        image.without_sky, sources, error=image.noise.total, mask=image.mask,
+        radius=radius, saturation=saturation, min_snr=options.min_snr,
+        max_stars=options.max_stars)
     if not stars['selected'].any():
         raise ValueError(_no_stars(image, stars))
     return stars

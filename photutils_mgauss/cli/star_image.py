@@ -173,6 +173,12 @@ class StarImage:
                 f'{unit} it takes --gain (electrons in a count or unit) and, '
                 f'for rates, --exposure-time')
 
+    def check(self):
+        """Raise if the image lacks what it takes to measure it."""
+        if self.layers.error is None and self.electrons is None:
+            raise ValueError(self._no_noise())
+        self.wcs, self.time  # noqa: B018 whether they can be read
+
     def describe(self):
         """Return a sentence on what was read."""
         ny, nx = self.data.shape
