@@ -1,6 +1,7 @@
 """The command ``mgauss``."""
 import argparse
 import re
+import sys
 from difflib import get_close_matches
 
 from photutils_mgauss import __version__
@@ -45,10 +46,11 @@ def main(argv=None):
         the command was interrupted.
     """
     parser = _parser()
-    options, unknown = parser.parse_known_args(argv)
+    words = sys.argv[1:] if argv is None else list(argv)
+    options, unknown = parser.parse_known_args(words)
     if unknown:
         options.parser.error(_unknown(options.parser, unknown))
-    return run_command(options, is_process=argv is None)
+    return run_command(options, words, is_process=argv is None)
 
 
 def _unknown(parser, words):

@@ -10,8 +10,8 @@ def add(commands):
     demo = tools.command(
         commands, 'demo', 'simulate a field at several epochs and measure it',
         'Simulate a small field at several epochs, make the PSF of each '
-        'image from its own\nstars, measure all stars, align the epochs on '
-        'quasars, fit proper motions, and\ncompare them with the truth.',
+        'image from its own stars, measure all stars, align the epochs on '
+        'quasars, fit proper motions, and compare them with the truth.',
         'mgauss demo --epochs 3 --output my_demo', run)
     tools.add_folder(demo, 'mgauss_demo')
     demo.add_argument('--epochs', type=int, choices=range(2, 8), default=5,

@@ -1,10 +1,12 @@
 """``mgauss motions``: catalogues or images to motions and corrected WCS."""
 import json
+from functools import partial
 from pathlib import Path
 
 from photutils_mgauss.cli import photometry, tools
 from photutils_mgauss.cli import psf as psf_command
 from photutils_mgauss.cli.progress import Progress
+from photutils_mgauss.cli.results import Results, add_checkpoint, file_marks
 
 _TABLE_SUFFIXES = ('.ecsv', '.csv', '.txt', '.dat', '.vot', '.xml', '.votable')
 
@@ -17,9 +19,9 @@ def add(commands):
     parser = tools.command(
         commands, 'motions', 'proper motions and corrected WCS',
         'Match the stars of two or more exposures, align the exposures on '
-        'objects of known\nmotion, and fit proper motions. Inputs are '
-        'catalogues, of mgauss photometry or with\nra, dec and their errors, '
-        'or images, which are measured first. Without references\nthe '
+        'objects of known motion, and fit proper motions. Inputs are '
+        'catalogues, of mgauss photometry or with ra, dec and their errors, '
+        'or images, which are measured first. Without references the '
         'motions are relative to the mean of the stars.',
         'mgauss motions night1_cat.ecsv night2_cat.ecsv '
         '--references quasars.ecsv', run)
@@ -33,6 +35,7 @@ def add(commands):
     psf_command.add_fit(parser)
     photometry.add_measuring(parser)
     tools.add_reading(parser)
+    add_checkpoint(parser)
     tools.add_overwrite(parser)
     parser.set_defaults(grid_shape=[30, 30])
 
@@ -78,7 +81,8 @@ def run(options):
     names = _Names(folder, paths, are_tables, options.format)
     read = tools.read_images(options, paths)
     fitter = _fitter(options)
-    tools.claim(names.all(), options.overwrite, paths)
+    results = Results(options)
+    results.claim(names.all(), paths)
     with Progress(1 + len(paths) + 2, options) as step:
         step('look at all files')
         epochs = [_from_catalogue(options, i) if are_tables[i]
@@ -87,12 +91,14 @@ def run(options):
         for i, path in enumerate(paths):
             step(f'measure {path}' if epochs[i] is None else f'use {path}')
             if epochs[i] is None:
-                epochs[i] = _from_image(options, read(i), names, i)
+                epochs[i] = _from_image(options, read(i), names, i, results)
             tools.say(options, f'{path}: {epochs[i]!r}')
         step('align and fit')
         solution = fitter.fit(epochs)
         step(f'write to {folder}')
-        _write(solution, names, options)
+        _collect(solution, names, options, results)
+        # Nothing is written before all is well.
+        results.deliver()
     tools.say(options, *_summary(solution), f'files are in {folder}')
 
 
@@ -158,16 +164,20 @@ def _check_image(options, image):
         raise ValueError(_no_time(image.path))
 
 
-def _from_image(options, image, names, i):
-    """Return the epoch of an image; write its PSF and catalogue."""
-    psf, found = psf_command.from_stars(image, options)
-    psf_command.write(psf, names.psfs[i], tools.record_of(
-        options, input=str(image.path), **found))
-    table = photometry.measure(image, psf, options)
-    exposure = photometry.exposure(image, names.catalogues[i])
-    tools.write_table(table, names.catalogues[i],
-                      tools.record_of(options, exposure=exposure))
+def _from_image(options, image, names, i, results):
+    """Return the epoch of an image."""
+    key = results.key(file_marks(image.path, image.reading.wcs,
+                                 options.stars), image.content)
+    psf = results.obtain(names.psfs[i], key, partial(
+        psf_command.make, options, image), psf_command.read)
+    name = names.catalogues[i]
+    table = results.obtain(name, f'{key}_cat', partial(
+        photometry.make, options, image, psf, name), _read_table)
     return _epoch(options, image.path, table, image.wcs, image.time)
+
+
+def _read_table(path):
+    return tools.read_table(path)[0]
 
 
 def _from_catalogue(options, i):
@@ -265,32 +275,61 @@ def _fitter(options):
 def _references(options):
     if options.references is None:
         return None
+    from photutils_mgauss.motions.references import read_catalogue
+    from photutils_mgauss.sky.tangent_plane import TangentPlane
     table, _ = tools.read_table(options.references)
     if options.reference_class is not None:
         table['class'] = options.reference_class
     # Identifiers of another catalogue say nothing about these stars.
-    return table[[name for name in table.colnames if name != 'id']]
+    table = table[[name for name in table.colnames if name != 'id']]
+    with tools.about(options.references):
+        # Whether it can be used is found out before anything is measured.
+        if options.plane:
+            read_catalogue(table, None, 'pix')
+        else:
+            read_catalogue(table, TangentPlane(0.0, 0.0), 'mas')
+    return table
 
 
-def _write(solution, names, options):
+def _collect(solution, names, options, results):
+    """Obtain the tables and the WCS."""
+    key = results.key(_content(solution))
     for name, path in names.tables.items():
         table = getattr(solution, 'stars' if name == 'motions' else name)
-        tools.write_table(table, path, tools.record_of(
+        write = partial(tools.write_table, table, record=tools.record_of(
             options, notes=list(solution.notes)))
-    for epoch, name in zip(solution.epochs, names.wcs, strict=True):
+        results.obtain(path, f'{key}_{name}', partial(_made, table, write))
+    for i, (epoch, name) in enumerate(zip(solution.epochs, names.wcs,
+                                          strict=True)):
         if epoch.wcs is not None:
-            write_wcs(epoch, name, tools.record_of(options))
+            suffix, write = wcs_writer(epoch, tools.record_of(options))
+            results.obtain(name.with_suffix(suffix), f'{key}_wcs{i}',
+                           partial(_made, epoch.wcs, write))
 
 
-def write_wcs(epoch, name, record):
-    """Write a WCS: a gwcs as ASDF, any other as a FITS header."""
+def _made(result, write):
+    return result, write
+
+
+def _content(solution):
+    """Return the numbers of a solution, by which it is known again."""
+    import numpy as np
+    return [[np.asarray(getattr(column, 'value', column))
+             for column in table.itercols()] for table in (
+                 solution.stars, solution.alignment, solution.residuals)]
+
+
+def wcs_writer(epoch, record):
+    """
+    Return the suffix of a WCS, and what writes it.
+
+    A gwcs is written as ASDF, any other as a FITS header.
+    """
     from gwcs import WCS as GWCS
     if isinstance(epoch.wcs, GWCS):
         import asdf
-        with tools.whole_file(name.with_suffix('.asdf')) as draft:
-            asdf.AsdfFile({'wcs': epoch.wcs, 'mgauss': record}).write_to(
-                draft)
-        return
+        return '.asdf', asdf.AsdfFile({'wcs': epoch.wcs,
+                                       'mgauss': record}).write_to
     from astropy.io import fits
 
     from photutils_mgauss.sky.observers import tdb
@@ -298,8 +337,7 @@ def write_wcs(epoch, name, record):
     header['MJD-AVG'] = tdb(epoch.mean_year).mjd, 'middle of the exposure'
     header['TIMESYS'] = 'TDB'
     header['MGRUN'] = json.dumps(record)
-    with tools.whole_file(name.with_suffix('.fits')) as draft:
-        fits.PrimaryHDU(header=header).writeto(draft)
+    return '.fits', fits.PrimaryHDU(header=header).writeto
 
 
 def _summary(solution):

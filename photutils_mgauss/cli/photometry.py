@@ -1,10 +1,12 @@
 """``mgauss photometry``: images and PSFs to catalogues."""
 import os
+from functools import partial
 from pathlib import Path
 
 from photutils_mgauss.cli import psf as psf_command
 from photutils_mgauss.cli import tools
 from photutils_mgauss.cli.progress import Progress
+from photutils_mgauss.cli.results import Results, add_checkpoint, file_marks
 
 _SUFFIXES = ('.ecsv', '.fits')
 
@@ -18,7 +20,7 @@ def add(commands):
     parser = tools.command(
         commands, 'photometry', 'positions and fluxes of the stars in images',
         'Find the stars of each image and fit their positions and fluxes. '
-        "The catalogue has\nphotutils' columns and, if the image has a WCS, "
+        "The catalogue has photutils' columns and, if the image has a WCS, "
         'places on the sky with covariances.',
         'mgauss photometry night1.fits --psf night1_psf.fits', run)
     tools.add_inputs(parser, 'IMAGE', 'images')
@@ -31,6 +33,7 @@ def add(commands):
     add_measuring(parser)
     tools.add_times(parser)
     tools.add_reading(parser)
+    add_checkpoint(parser)
     tools.add_overwrite(parser)
 
 
@@ -56,29 +59,40 @@ def run(options):
                                '.ecsv')
     owners = tools.one_each(options.psf, len(paths), 'psf')
     read = tools.read_images(options, paths)
-    tools.claim(names, options.overwrite, [*paths, *options.psf])
-    with Progress(1 + 2 * len(names), options) as step:
+    results = Results(options)
+    results.claim(names, [*paths, *options.psf])
+    with Progress(1 + len(names), options) as step:
         step('look at all files')
-        psfs = {path: _read_psf(path) for path in dict.fromkeys(owners)}
+        psfs = {path: _read_psf(path, options.checkpoint)
+                for path in dict.fromkeys(owners)}
         for i in range(len(paths)):
             psf_command.check_image(read(i))
         for i, name in enumerate(names):
-            step(f'read {paths[i]}')
-            image = read(i)
-            tools.say(options, image.describe())
             step(f'measure {paths[i]}')
-            table = measure(image, psfs[owners[i]], options)
-            record = tools.record_of(options, exposure=exposure(image, name),
-                                     psf=str(owners[i]),
-                                     reading=image.layers.sources)
-            tools.write_table(table, name, record)
-            tools.say(options, f'{name}: {len(table)} stars')
+            image = read(i)
+            key = results.key(file_marks(paths[i], owners[i],
+                                         image.reading.wcs), image.content)
+            results.obtain(name, key, partial(
+                make, options, image, psfs[owners[i]], name,
+                psf=str(owners[i])))
+            results.deliver()
+            tools.say(options, f'{name} is written')
 
 
-def _read_psf(path):
+def _read_psf(path, checkpoint):
     from photutils_mgauss.cli.psf_files import read_psf
     with tools.about(path):
-        return read_psf(path)
+        return read_psf(path, checkpoint=checkpoint)
+
+
+def make(options, image, model, name, **more):
+    """Return the catalogue of an image, and what writes it."""
+    tools.say(options, image.describe())
+    table = measure(image, model, options)
+    tools.say(options, f'{image.path}: {len(table)} stars')
+    return table, partial(tools.write_table, table, record=tools.record_of(
+        options, exposure=exposure(image, name),
+        reading=image.layers.sources, **more))
 
 
 def measure(image, psf, options):
@@ -113,7 +127,7 @@ def _crowded(image, psf, options):
     from photutils_mgauss.crowded.photometry import CrowdedMixturePhotometry
     photometry = CrowdedMixturePhotometry(
         psf, threshold=options.threshold or 4.5,
-        effective_gain=image.noise.gain)
+        effective_gain=image.noise.gain, checkpoint=options.checkpoint)
     return photometry(image.data, error=image.noise.total, mask=image.mask)
 
 

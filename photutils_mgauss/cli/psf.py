@@ -1,6 +1,9 @@
 """``mgauss psf``: images or PSF files to grids of mixtures."""
+from functools import partial
+
 from photutils_mgauss.cli import tools
 from photutils_mgauss.cli.progress import Progress
+from photutils_mgauss.cli.results import Results, add_checkpoint, file_marks
 
 _SUFFIXES = ('.fits', '.asdf')
 
@@ -12,8 +15,8 @@ def add(commands):
     parser = tools.command(
         commands, 'psf', "make a PSF of an image's own stars, or of a PSF "
         'file', 'Make a grid of Gaussian mixtures for each input. Of an '
-        "image, it is made of\nthe image's own stars; PSFEx models, STDPSF "
-        'and STPSF grids and ePSFs (images\nwith the keyword OVERSAMP) are '
+        "image, it is made of the image's own stars; PSFEx models, STDPSF "
+        'and STPSF grids and ePSFs (images with the keyword OVERSAMP) are '
         'fitted.', 'mgauss psf night1.fits night2.fits --output psfs',
         run)
     tools.add_inputs(parser, 'FILE', 'images or PSF files')
@@ -26,6 +29,7 @@ def add(commands):
     add_fit(parser)
     _add_files(parser)
     tools.add_reading(parser)
+    add_checkpoint(parser)
     tools.add_overwrite(parser)
 
 
@@ -67,17 +71,21 @@ def run(options):
     names = tools.output_names(paths, options.output, '_psf', _SUFFIXES,
                                '.fits')
     read = tools.read_images(options, paths)
-    tools.claim(names, options.overwrite, paths)
-    with Progress(1 + 2 * len(names), options) as step:
+    results = Results(options)
+    results.claim(names, paths)
+    with Progress(1 + len(names), options) as step:
         step('look at all files')
         kinds = [_kind(options, path, lambda i=i: read(i))
                  for i, path in enumerate(paths)]
         for i, (path, name) in enumerate(zip(paths, names, strict=True)):
-            step(f'read {path}')
-            psf, found = _make(options, path, kinds[i], lambda i=i: read(i),
-                               step)
-            write(psf, name, tools.record_of(options, input=path, **found))
-            tools.say(options, f'{name}: {_describe(psf, found)}')
+            step(f'PSF of {path}')
+            image = read(i) if kinds[i] == 'image' else None
+            key = results.key(file_marks(path, options.stars),
+                              image and image.content)
+            results.obtain(name, key, partial(_make, options, path, image,
+                                              kinds[i]))
+            results.deliver()
+            tools.say(options, f'{name} is written')
 
 
 def _kind(options, path, read):
@@ -102,15 +110,32 @@ def check_image(image):
         image.check()
 
 
-def _make(options, path, kind, read, step):
-    """Return the grid of one input, and what is to be said of it."""
-    if kind == 'image':
-        image = read()
+def _make(options, path, image, kind):
+    """Return the grid of one input, and what writes it."""
+    if image is not None:
         tools.say(options, image.describe())
-        step(f'PSF of {path}')
-        return from_stars(image, options)
-    step(f'fit {path}')
-    return from_file(path, options), {'kind': kind}
+        return make(options, image)
+    return _with_writer(options, path, from_file(path, options),
+                        {'kind': kind})
+
+
+def read(path):
+    """Read a PSF that was written before."""
+    from photutils_mgauss.cli.psf_files import read_psf
+    with tools.about(path):
+        return read_psf(path)
+
+
+def make(options, image):
+    """Return the PSF of an image's own stars, and what writes it."""
+    return _with_writer(options, image.path, *from_stars(image, options))
+
+
+def _with_writer(options, path, psf, found):
+    from photutils_mgauss.cli.psf_files import write_psf
+    tools.say(options, f'{path}: {_describe(psf, found)}')
+    return psf, partial(write_psf, psf, record=tools.record_of(
+        options, input=str(path), **found))
 
 
 def from_file(path, options):
@@ -121,7 +146,8 @@ def from_file(path, options):
         return read_psf(path, n_components=3 if number is None else number,
                         grid_shape=tuple(options.grid_shape),
                         radius=options.radius, detector=options.detector,
-                        oversampling=options.oversampling)
+                        oversampling=options.oversampling,
+                        checkpoint=options.checkpoint)
 
 
 def from_stars(image, options):
@@ -175,13 +201,6 @@ def _no_stars(image, stars):
                        for reason in sorted(set(reasons)))
     return (f'{image.path}: must have at least 1 star good for the PSF, got '
             f'none of {len(stars)}: {counts}; try --min-snr or --radius')
-
-
-def write(psf, name, record):
-    """Write a grid, whole or not at all."""
-    from photutils_mgauss.cli.psf_files import write_psf
-    with tools.whole_file(name) as draft:
-        write_psf(psf, draft, record)
 
 
 def _describe(psf, found):

@@ -70,7 +70,7 @@ def _class_in_asdf(path):
 
 
 def read_psf(path, *, n_components=3, grid_shape=(30, 30), radius=None,
-             detector=None, oversampling=None, progress_bar=False):
+             detector=None, oversampling=None, checkpoint=None):
     """
     Read a PSF file as a grid of mixtures.
 
@@ -89,8 +89,8 @@ def read_psf(path, *, n_components=3, grid_shape=(30, 30), radius=None,
         Which detector of an STDPSF file.
     oversampling : int, optional
         Of an image of one ePSF, if its header has no OVERSAMP.
-    progress_bar : bool, optional
-        Whether to show how many nodes are done.
+    checkpoint : str or path-like, optional
+        A folder in which finished fits are kept, and looked for.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def read_psf(path, *, n_components=3, grid_shape=(30, 30), radius=None,
     if kind == 'image' and oversampling is not None:
         kind = 'epsf'
     fit = {'n_components': n_components, 'radius': radius,
-           'progress_bar': progress_bar}
+           'checkpoint': checkpoint}
     if kind == 'mixtures':
         return _own(path, grid_shape)
     if kind == 'psfex':

@@ -11,7 +11,7 @@ def add(commands):
     parser = tools.command(
         commands, 'report', 'figures and a page of HTML of results',
         'Show PSFs, catalogues and proper motions on one page of HTML, which '
-        'has its figures\ninside and needs no other file.',
+        'has its figures inside and needs no other file.',
         'mgauss report night1_psf.fits night1_cat.ecsv mgauss_motions '
         '--output report.html', run)
     tools.add_inputs(parser, 'PATH',

@@ -24,7 +24,7 @@ class _TerminatedError(KeyboardInterrupt):
     """The process was asked to end, as by a batch system."""
 
 
-def run_command(options, *, is_process):
+def run_command(options, words, *, is_process):
     """
     Run a command.
 
@@ -32,6 +32,8 @@ def run_command(options, *, is_process):
     ----------
     options : `argparse.Namespace`
         With the function ``run``, which is called with them.
+    words : sequence of str
+        What the options were made of.
     is_process : bool
         Whether the command is all that the process does. It then ends at
         once when it is interrupted, also inside a compiled loop.
@@ -44,9 +46,13 @@ def run_command(options, *, is_process):
     with warnings.catch_warnings():
         if not sys.warnoptions:
             warnings.simplefilter('default')
+            # What only programmers can do something about.
+            for kind in (ResourceWarning, DeprecationWarning,
+                         PendingDeprecationWarning, FutureWarning):
+                warnings.simplefilter('ignore', kind)
         warnings.showwarning = _show_warning
         try:
-            with _log_file(options.log_file):
+            with _log_file(options.log_file, words):
                 return _run(options, is_process)
         except OSError as error:
             _complain(tools.sentence_of(error))
@@ -104,7 +110,7 @@ def _leave(error):
 
 
 @contextmanager
-def _log_file(path):
+def _log_file(path, words):
     """Write all that is said into a file, too."""
     tools.LOG.setLevel(logging.DEBUG)
     tools.LOG.propagate = False
@@ -113,7 +119,7 @@ def _log_file(path):
     handler.setFormatter(logging.Formatter(
         '%(asctime)s %(levelname)s %(message)s'))
     tools.LOG.addHandler(handler)
-    tools.LOG.info('mgauss %s', ' '.join(sys.argv[1:]))
+    tools.LOG.info('mgauss %s', ' '.join(words))
     try:
         yield
     finally:

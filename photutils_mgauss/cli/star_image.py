@@ -96,6 +96,12 @@ class StarImage:
         """The unit of the values, or None."""
         return self.layers.cards.unit
 
+    @property
+    def content(self):
+        """What a measurement depends on, besides its options."""
+        return [self.data, self.layers.error, self.mask, self.electrons,
+                self.saturation]
+
     @cached_property
     def wcs(self):
         """The WCS, or None."""

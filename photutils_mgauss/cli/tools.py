@@ -17,7 +17,7 @@ from tqdm import tqdm
 from photutils_mgauss import __version__
 
 # What is no option of a run.
-_NOT_STORED = ('run', 'parser', 'quiet', 'log_file', 'overwrite')
+NOT_STORED = ('run', 'parser', 'quiet', 'log_file', 'overwrite')
 # What is wrong is said in no more letters than these.
 _LONGEST = 500
 # Errors of these kinds are sentences already.
@@ -32,7 +32,7 @@ LOG = logging.getLogger('mgauss')
 def command(commands, name, words, description, example, run):
     """Add a command with its help; return its parser."""
     parser = commands.add_parser(
-        name, help=words, description=description,
+        name, help=words, description=textwrap.fill(description, 78),
         epilog='example: ' + example,
         formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--quiet', action='store_true',
@@ -401,14 +401,14 @@ def clear_up():
 def record_of(options, **more):
     """Return what is stored with results: command, options, version, date."""
     used = {name: value for name, value in vars(options).items()
-            if name not in _NOT_STORED}
+            if name not in (*NOT_STORED, 'checkpoint')}
     return {'command': used.pop('command'), 'version': __version__,
             'date': datetime.now(UTC).isoformat(timespec='seconds'),
             'options': used, **more}
 
 
 def write_table(table, path, record):
-    """Write a table with the record of its run, as ECSV or FITS."""
+    """Write a table with the record of its run into an ECSV or FITS file."""
     table = table.copy()
     if path.suffix == '.fits':
         kept = {key: value for key, value in table.meta.items()
@@ -416,10 +416,10 @@ def write_table(table, path, record):
         table.meta = {**kept, 'MGRUN': json.dumps(record)}
     else:
         table.meta['mgauss'] = record
-    with whole_file(path) as draft, warnings.catch_warnings():
+    with warnings.catch_warnings():
         # FITS has no electrons; astropy notes them down all the same.
         warnings.filterwarnings('ignore', 'The unit .* could not be saved')
-        table.write(draft)
+        table.write(path)
 
 
 def read_table(path):
@@ -435,8 +435,7 @@ def read_table(path):
         raise
     except Exception as error:
         # Readers of tables raise what they please.
-        msg = (f'{path}: must be a table that astropy can read, got: '
-               f'{sentence_of(error)}')
+        msg = f'{path}: must be a table that astropy can read, got: {error}'
         raise ValueError(msg) from error
     text = table.meta.get('MGRUN')
     record = table.meta.get('mgauss', {}) if text is None else (

@@ -40,11 +40,11 @@ def digest_of(*things):
 
 
 def _feed(digest, thing):
-    if isinstance(thing, np.ndarray):
+    if isinstance(thing, np.ndarray) and not thing.dtype.hasobject:
         digest.update(f'{thing.dtype.str}{thing.shape}'.encode())
         digest.update(np.ascontiguousarray(thing).view(np.uint8).data
                       if thing.size else b'')
-    elif isinstance(thing, (list, tuple)):
+    elif isinstance(thing, (list, tuple, np.ndarray)):
         digest.update(f'({len(thing)}'.encode())
         for one in thing:
             _feed(digest, one)
