@@ -1,14 +1,20 @@
 """``mgauss motions``: catalogues or images to motions and corrected WCS."""
 import json
-from functools import partial
+import warnings
+from functools import cache, partial
 from pathlib import Path
 
 from photutils_mgauss.cli import photometry, tools
 from photutils_mgauss.cli import psf as psf_command
+from photutils_mgauss.cli.observers import check_observer, observer_at
 from photutils_mgauss.cli.progress import Progress
 from photutils_mgauss.cli.results import Results, add_checkpoint, file_marks
 
 _TABLE_SUFFIXES = ('.ecsv', '.csv', '.txt', '.dat', '.vot', '.xml', '.votable')
+
+# As many stars are too few to find out about the errors of exposures.
+_FEW = 5
+_TOO_MUCH = 2.0
 
 # Running numbers of one image are no names of stars.
 _NUMBERS = ('id', 'group_id')
@@ -49,16 +55,27 @@ def _add_solution(parser):
                        choices=('qso', 'galaxy', 'star', 'position'),
                        help='class of all references, for tables without '
                             'that column')
-    group.add_argument('--transform', default='affine',
-                       help='what may differ between exposures: shift, '
-                            'rigid, similarity, affine, poly-2, ... '
-                            '(default: %(default)s)')
+    group.add_argument('--transform', metavar='KIND',
+                       help='what may differ between exposures: none, '
+                            'shift, rigid, similarity, affine, poly-2, ... '
+                            '(default: %(default)s, or none with '
+                            '--parallax-of)')
     group.add_argument('--recipe', choices=('joint', 'two-step', 'paper'),
                        default='joint', help='default: %(default)s')
     group.add_argument('--parallax', action='store_true',
                        help='fit parallaxes, too')
-    group.add_argument('--observer', choices=('earth', 'leo', 'l2'),
-                       help='from where parallaxes are seen')
+    group.add_argument('--parallax-of', metavar='TABLE',
+                       help='fit only the parallaxes of the objects in a '
+                            'table, with id, ra, dec, pmra, pmdec, ref_epoch '
+                            '(and errors), and a rough parallax, by which '
+                            'they are found')
+    group.add_argument('--systematic', type=tools.positive, metavar='MAS',
+                       help='error of each exposure to be added to those of '
+                            'its stars (default: fitted)')
+    group.add_argument('--observer', metavar='NAME',
+                       help='from where parallaxes are seen: earth, leo, l2, '
+                            'or a table of barycentric places x, y, z [au], '
+                            'one for each exposure or with their times')
     group.add_argument('--max-motion', type=tools.positive, default=50,
                        metavar='MAS/YR', help='largest motion considered in '
                        'matching (default: %(default)s)')
@@ -104,8 +121,14 @@ def run(options):
 
 def _check(options):
     """Raise for what is wrong before anything is read."""
-    tools.check_inputs([*options.inputs, options.references, options.stars])
+    tools.check_inputs([*options.inputs, options.references, options.stars,
+                        options.parallax_of])
+    if options.parallax_of and (options.references or options.plane):
+        msg = ('--parallax-of must be given without --references and '
+               '--plane: its table has the references')
+        raise ValueError(msg)
     tools.check_different(options.inputs)
+    check_observer(options.observer, len(options.inputs))
     if len(options.inputs) < 2:
         msg = (f'inputs must be at least 2 exposures, got only '
                f'{options.inputs[0]}')
@@ -227,7 +250,35 @@ def _epoch(options, path, table, wcs, time):
     if wcs is None and not options.plane:
         table = _on_the_sky(path, table)
     with tools.about(path):
-        return Epoch(table, wcs, time, observer=options.observer)
+        observer = observer_at(options.observer, path, options.inputs,
+                               table['time'] if time is None else time)
+        if options.parallax_of:
+            table = _only_targets(options, path, table, time, observer)
+        return Epoch(table, wcs, time, observer=observer)
+
+
+@cache
+def _targets(path):
+    from photutils_mgauss.cli.targets import check_targets
+    table, _ = tools.read_table(path)
+    with tools.about(path):
+        check_targets(table)
+    return table
+
+
+def _only_targets(options, path, table, time, observer):
+    import numpy as np
+
+    from photutils_mgauss.cli.targets import only_targets
+    from photutils_mgauss.sky.observers import julian_years
+    years = julian_years(table['time'] if time is None else time)
+    if 'ra' not in table.colnames:
+        raise ValueError(_no_sky(path))
+    found, words = only_targets(table, _targets(options.parallax_of),
+                                float(np.nanmean(years)), observer,
+                                options.match_radius)
+    tools.say(options, *(f'{path}: {one}' for one in words))
+    return found
 
 
 def _usable(table, good_flags):
@@ -264,15 +315,22 @@ def _fitter(options):
     import astropy.units as u
 
     from photutils_mgauss.motions import ProperMotionFitter
-    radius = options.match_radius
+    radius, alone = options.match_radius, options.parallax_of is not None
+    transform = options.transform or ('none' if alone else 'affine')
+    systematic = options.systematic
     return ProperMotionFitter(
-        transform=options.transform, recipe=options.recipe,
-        parallax=options.parallax, references=_references(options),
+        transform=None if transform == 'none' else transform,
+        recipe=options.recipe, parallax=alone or options.parallax,
+        references=_references(options), match_by='id' if alone else 'auto',
+        systematic='fit' if systematic is None else systematic * u.mas,
         max_motion=options.max_motion * u.mas / u.yr,
         match_radius=None if radius is None else radius * u.mas)
 
 
 def _references(options):
+    if options.parallax_of is not None:
+        from photutils_mgauss.cli.targets import without_parallax
+        return without_parallax(_targets(options.parallax_of))
     if options.references is None:
         return None
     from photutils_mgauss.motions.references import read_catalogue
@@ -350,4 +408,32 @@ def _summary(solution):
     if solved.any():
         median = np.median([error.value[solved] for error in errors])
         lines.append(f'median error {median:.3g} {errors[0].unit}')
+    lines += _parallaxes(stars)
+    _check_scatter(solution)
     return [*lines, *(f'note: {note}' for note in solution.notes)]
+
+
+def _parallaxes(stars):
+    """Return a line for each parallax, if there are only a few."""
+    import numpy as np
+    if 'parallax' not in stars.colnames:
+        return []
+    known = stars[np.isfinite(stars['parallax_error'].value)]
+    return [f'parallax of {star["id"]}: {star["parallax"].value:.3f} +- '
+            f'{star["parallax_error"]:.3f}'
+            for star in known] if len(known) <= _FEW else []
+
+
+def _check_scatter(solution):
+    """Warn if the detections scatter more than their errors allow."""
+    import numpy as np
+    rows = solution.residuals
+    pulls = np.concatenate([(rows[name] / rows[f'{name}_error']).value
+                            for name in ('dra', 'ddec')])
+    pulls = pulls[np.isfinite(pulls) & (pulls != 0)]
+    scatter = np.sqrt(np.mean(pulls**2)) if pulls.size else 0
+    if len(solution.stars) <= _FEW and scatter > _TOO_MUCH:
+        warnings.warn(
+            f'positions scatter {scatter:.3g} times as much as their errors '
+            'allow, and so may the results; give --systematic, the error of '
+            'an exposure', UserWarning, stacklevel=2)

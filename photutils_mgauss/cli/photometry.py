@@ -1,5 +1,6 @@
 """``mgauss photometry``: images and PSFs to catalogues."""
 import os
+import warnings
 from functools import partial
 from pathlib import Path
 
@@ -9,6 +10,11 @@ from photutils_mgauss.cli.progress import Progress
 from photutils_mgauss.cli.results import Results, add_checkpoint, file_marks
 
 _SUFFIXES = ('.ecsv', '.fits')
+
+# Stars of a larger signal-to-noise ratio should not have, in the median, a
+# larger reduced chi2.
+_BRIGHT = 100.0
+_BAD_CHI2 = 5.0
 
 # Columns in the unit of the image.
 _FLUXES = ('flux_init', 'flux_fit', 'flux_err', 'local_bkg', 'sky',
@@ -103,7 +109,24 @@ def measure(image, psf, options):
         if table is None or len(table) == 0:
             msg = 'must show a star, got none; try --threshold'
             raise ValueError(msg)
+        _check_fits(image, table)
         return _with_sky(_with_unit(table, image.unit), image)
+
+
+def _check_fits(image, table):
+    """Warn if the PSF does not describe the bright stars."""
+    import numpy as np
+    if 'reduced_chi2' not in table.colnames:
+        return
+    signal = table['flux_fit'] / table['flux_err']
+    chi2 = np.asarray(table['reduced_chi2'])[
+        (signal > _BRIGHT) & np.isfinite(table['reduced_chi2'])]
+    if chi2.size and np.median(chi2) > _BAD_CHI2:
+        warnings.warn(
+            f'{image.path}: the PSF does not describe the {chi2.size} '
+            f'brightest stars (median reduced chi2 {np.median(chi2):.3g}); '
+            'their errors do not contain that of the PSF', UserWarning,
+            stacklevel=2)
 
 
 def _sparse(image, psf, options):

@@ -43,20 +43,45 @@ def run_command(options, words, *, is_process):
     int
         The exit code.
     """
-    with warnings.catch_warnings():
-        if not sys.warnoptions:
-            warnings.simplefilter('default')
-            # What only programmers can do something about.
-            for kind in (ResourceWarning, DeprecationWarning,
-                         PendingDeprecationWarning, FutureWarning):
-                warnings.simplefilter('ignore', kind)
-        warnings.showwarning = _show_warning
+    with _warnings_shown():
         try:
             with _log_file(options.log_file, words):
                 return _run(options, is_process)
         except OSError as error:
             _complain(tools.sentence_of(error))
             return 1
+
+
+@contextmanager
+def _warnings_shown():
+    """Show each warning as a line, and only once."""
+    from astropy import log
+    from astropy.logger import LoggingError
+    known = set()
+
+    def show(message, *_, **__):
+        words = tools.one_line(str(message))
+        if words not in known:
+            known.add(words)
+            _warn(words)
+
+    # Or astropy would show its own.
+    was_logged = log.warnings_logging_enabled()
+    with suppress(LoggingError):
+        log.disable_warnings_logging()
+    try:
+        with warnings.catch_warnings():
+            if not sys.warnoptions:
+                warnings.simplefilter('default')
+                # What only programmers can do something about.
+                for kind in (ResourceWarning, DeprecationWarning,
+                             PendingDeprecationWarning, FutureWarning):
+                    warnings.simplefilter('ignore', kind)
+            warnings.showwarning = show
+            yield
+    finally:
+        if was_logged and not log.warnings_logging_enabled():
+            log.enable_warnings_logging()
 
 
 def _run(options, is_process):
@@ -132,7 +157,6 @@ def _complain(words):
     tqdm.write(f'mgauss: {words}', file=sys.stderr)
 
 
-def _show_warning(message, *_, **__):
-    words = tools.one_line(str(message))
+def _warn(words):
     tools.LOG.warning('%s', words)
     tqdm.write(f'mgauss: warning: {words}', file=sys.stderr)

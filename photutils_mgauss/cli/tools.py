@@ -71,6 +71,10 @@ def add_reading(parser):
             'or one for each.', 76))
     group.add_argument('--ext', metavar='NAME',
                        help='extension with the image: 1, SCI or SCI,2')
+    group.add_argument('--error-ext', metavar='NAME',
+                       help='extension with the errors')
+    group.add_argument('--flags-ext', metavar='NAME',
+                       help='extension with the flags of bad pixels')
     for name, words in (('error', 'standard deviations of the pixels'),
                         ('weight', 'inverse variances of the pixels'),
                         ('flags', 'flags of bad pixels'),
@@ -99,6 +103,9 @@ def add_times(parser):
     parser.add_argument('--time', nargs='+', metavar='TIME',
                         help='middle of each exposure, as 2027-03-14T15:09 '
                              '(UTC) or as a Julian year, 2027.2')
+    parser.add_argument('--time-key', metavar='KEYWORD',
+                        help='keyword of the header with the middle of the '
+                             'exposure, a date, a Julian date or a year')
 
 
 def positive(text):
@@ -235,8 +242,9 @@ def read_images(options, paths):
     times = [parse_time(text) for text in
              one_each(getattr(options, 'time', None), n, 'time')]
     common = {name: getattr(options, name) for name in (
-        'ext', 'good_bits', 'gain', 'read_noise', 'exposure_time',
-        'saturation', 'sky_box')}
+        'ext', 'error_ext', 'flags_ext', 'good_bits', 'gain', 'read_noise',
+        'exposure_time', 'saturation', 'sky_box')}
+    common['time_key'] = getattr(options, 'time_key', None)
 
     def read(i):
         """Read an image."""
