@@ -1,9 +1,8 @@
 """The command ``mgauss``."""
 import argparse
+import re
 import sys
-import warnings
-
-from tqdm import tqdm
+from difflib import get_close_matches
 
 from photutils_mgauss import __version__
 from photutils_mgauss.cli import (
@@ -14,6 +13,7 @@ from photutils_mgauss.cli import (
     psf,
     report,
 )
+from photutils_mgauss.cli.running import run_command
 
 _COMMANDS = (psf, photometry, motions, report, demo_command, compile_command)
 
@@ -26,7 +26,7 @@ From two images to proper motions and a page that shows them:
   mgauss report night?_psf.fits night?_cat.ecsv mgauss_motions
 
 mgauss COMMAND --help explains each. Exit codes: 0 all went well, 1 an error
-was reported, 2 wrong usage.
+was reported, 2 wrong usage, 130 interrupted (Ctrl-C), 143 terminated.
 """
 
 
@@ -42,22 +42,23 @@ def main(argv=None):
     Returns
     -------
     int
-        The exit code: 0 if all went well, 1 if an error was reported.
+        The exit code: 0 if all went well, 1 if an error was reported, 130 if
+        the command was interrupted.
     """
-    options = _parser().parse_args(argv)
-    with warnings.catch_warnings():
-        if not sys.warnoptions:
-            warnings.simplefilter('default')
-        warnings.showwarning = _show_warning
-        try:
-            options.run(options)
-        except (OSError, ValueError, TypeError, RuntimeError) as error:
-            _complain(error)
-            return 1
-        except KeyboardInterrupt:
-            _complain('interrupted')
-            return 130
-    return 0
+    parser = _parser()
+    words = sys.argv[1:] if argv is None else list(argv)
+    options, unknown = parser.parse_known_args(words)
+    if unknown:
+        options.parser.error(_unknown(options.parser, unknown))
+    return run_command(options, words, is_process=argv is None)
+
+
+def _unknown(parser, words):
+    """Say which arguments are not known, and what may have been meant."""
+    text = f'unrecognized arguments: {" ".join(words)}'
+    known = re.findall(r'--[a-z-]+', parser.format_help())
+    near = get_close_matches(words[0].partition('=')[0], known, 1)
+    return f'{text} (did you mean {near[0]}?)' if near else text
 
 
 def _parser():
@@ -71,11 +72,3 @@ def _parser():
     for module in _COMMANDS:
         module.add(commands)
     return parser
-
-
-def _complain(words):
-    tqdm.write(f'mgauss: {words}', file=sys.stderr)
-
-
-def _show_warning(message, *_, **__):
-    _complain(f'warning: {message}')

@@ -7,13 +7,12 @@ from photutils_mgauss.cli import tools
 
 def add(commands):
     """Add the command to the parser's."""
-    parser = tools.command(
+    tools.command(
         commands, 'compile', 'compile all fits once, before they are needed',
         'Compile everything that the package would compile at the first call '
-        'of each kind,\nand keep it: for the image of a container, for the '
-        'workers of a cluster that\nshare a folder (NUMBA_CACHE_DIR), or to '
+        'of each kind, and keep it: for the image of a container, for the '
+        'workers of a cluster that share a folder (NUMBA_CACHE_DIR), or to '
         'wait now rather than later.', 'mgauss compile', run)
-    parser.add_argument('--quiet', action='store_true', help='print nothing')
 
 
 def run(options):

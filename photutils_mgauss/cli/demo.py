@@ -192,6 +192,7 @@ def _write_whole(what, path):
 
 def write_images(scenes, sources, folder):
     """Write the images and the quasars among the sources; return paths."""
+    folder.mkdir(parents=True, exist_ok=True)
     for number, scene in enumerate(scenes, 1):
         scene.write(folder / f'night{number}.fits', overwrite=True)
     quasars = sources[sources['kind'] == 'qso']['ra', 'dec']

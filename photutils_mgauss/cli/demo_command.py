@@ -1,9 +1,8 @@
 """``mgauss demo``: simulated images to motions beside the truth."""
 from pathlib import Path
 
-from tqdm import tqdm
-
 from photutils_mgauss.cli import tools
+from photutils_mgauss.cli.progress import Progress
 
 
 def add(commands):
@@ -11,8 +10,8 @@ def add(commands):
     demo = tools.command(
         commands, 'demo', 'simulate a field at several epochs and measure it',
         'Simulate a small field at several epochs, make the PSF of each '
-        'image from its own\nstars, measure all stars, align the epochs on '
-        'quasars, fit proper motions, and\ncompare them with the truth.',
+        'image from its own stars, measure all stars, align the epochs on '
+        'quasars, fit proper motions, and compare them with the truth.',
         'mgauss demo --epochs 3 --output my_demo', run)
     tools.add_folder(demo, 'mgauss_demo')
     demo.add_argument('--epochs', type=int, choices=range(2, 8), default=5,
@@ -26,33 +25,41 @@ def add(commands):
                       help='write the images, as FITS, and the quasars, and '
                            'measure nothing: something to try the other '
                            'commands on')
-    tools.add_common(demo)
+    tools.add_overwrite(demo)
 
 
 def run(options):
     """Run the demonstration."""
     folder = Path(options.output)
+    tools.check_folder(folder)
     if folder.exists() and any(folder.iterdir()) and not options.overwrite:
         msg = (f'{folder} has files in it; choose another --output or add '
                '--overwrite')
         raise FileExistsError(msg)
-    folder.mkdir(parents=True, exist_ok=True)
+    n_steps = options.epochs * (1 if options.images_only else 2) + 1
+    with Progress(n_steps, options) as step:
+        paths, lines = _make(options, folder, step)
+    tools.say(options, *lines, '', f'{len(paths)} files in {folder}')
+
+
+def _make(options, folder, step):
+    """Write the files; return their paths and what is to be said."""
     from photutils_mgauss.cli import demo
 
-    def progress(steps, words):
-        return tqdm(steps, desc=f'{words:10}', unit='epoch',
-                    disable=options.quiet)
+    def progress(pieces, words):
+        for number, piece in enumerate(pieces, 1):
+            step(f'{words} {number} of {len(pieces)}')
+            yield piece
 
     sources, scenes = demo.take_images(_settings(options, demo), progress)
     if options.images_only:
-        paths = demo.write_images(scenes, sources, folder)
-    else:
-        measured = [demo.measure(scene)
-                    for scene in progress(scenes, 'measure')]
-        result = demo.find_motions(measured, sources)
-        paths = demo.write(result, folder) + _draw(options, result, folder)
-        tools.say(options, *demo.summary(result))
-    tools.say(options, '', f'{len(paths)} files in {folder}')
+        step(f'write to {folder}')
+        return demo.write_images(scenes, sources, folder), []
+    measured = [demo.measure(scene) for scene in progress(scenes, 'measure')]
+    step('align and fit')
+    result = demo.find_motions(measured, sources)
+    paths = demo.write(result, folder) + _draw(options, result, folder)
+    return paths, demo.summary(result)
 
 
 def _settings(options, demo):

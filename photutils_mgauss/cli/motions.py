@@ -1,11 +1,20 @@
 """``mgauss motions``: catalogues or images to motions and corrected WCS."""
 import json
+import warnings
+from functools import cache, partial
 from pathlib import Path
 
 from photutils_mgauss.cli import photometry, tools
 from photutils_mgauss.cli import psf as psf_command
+from photutils_mgauss.cli.observers import check_observer, observer_at
+from photutils_mgauss.cli.progress import Progress
+from photutils_mgauss.cli.results import Results, add_checkpoint, file_marks
 
 _TABLE_SUFFIXES = ('.ecsv', '.csv', '.txt', '.dat', '.vot', '.xml', '.votable')
+
+# As many stars are too few to find out about the errors of exposures.
+_FEW = 5
+_TOO_MUCH = 2.0
 
 # Running numbers of one image are no names of stars.
 _NUMBERS = ('id', 'group_id')
@@ -16,9 +25,9 @@ def add(commands):
     parser = tools.command(
         commands, 'motions', 'proper motions and corrected WCS',
         'Match the stars of two or more exposures, align the exposures on '
-        'objects of known\nmotion, and fit proper motions. Inputs are '
-        'catalogues, of mgauss photometry or with\nra, dec and their errors, '
-        'or images, which are measured first. Without references\nthe '
+        'objects of known motion, and fit proper motions. Inputs are '
+        'catalogues, of mgauss photometry or with ra, dec and their errors, '
+        'or images, which are measured first. Without references the '
         'motions are relative to the mean of the stars.',
         'mgauss motions night1_cat.ecsv night2_cat.ecsv '
         '--references quasars.ecsv', run)
@@ -32,7 +41,8 @@ def add(commands):
     psf_command.add_fit(parser)
     photometry.add_measuring(parser)
     tools.add_reading(parser)
-    tools.add_common(parser)
+    add_checkpoint(parser)
+    tools.add_overwrite(parser)
     parser.set_defaults(grid_shape=[30, 30])
 
 
@@ -45,25 +55,36 @@ def _add_solution(parser):
                        choices=('qso', 'galaxy', 'star', 'position'),
                        help='class of all references, for tables without '
                             'that column')
-    group.add_argument('--transform', default='affine',
-                       help='what may differ between exposures: shift, '
-                            'rigid, similarity, affine, poly-2, ... '
-                            '(default: %(default)s)')
+    group.add_argument('--transform', metavar='KIND',
+                       help='what may differ between exposures: none, '
+                            'shift, rigid, similarity, affine, poly-2, ... '
+                            '(default: %(default)s, or none with '
+                            '--parallax-of)')
     group.add_argument('--recipe', choices=('joint', 'two-step', 'paper'),
                        default='joint', help='default: %(default)s')
     group.add_argument('--parallax', action='store_true',
                        help='fit parallaxes, too')
-    group.add_argument('--observer', choices=('earth', 'leo', 'l2'),
-                       help='from where parallaxes are seen')
+    group.add_argument('--parallax-of', metavar='TABLE',
+                       help='fit only the parallaxes of the objects in a '
+                            'table, with id, ra, dec, pmra, pmdec, ref_epoch '
+                            '(and errors), and a rough parallax, by which '
+                            'they are found')
+    group.add_argument('--systematic', type=tools.positive, metavar='MAS',
+                       help='error of each exposure to be added to those of '
+                            'its stars (default: fitted)')
+    group.add_argument('--observer', metavar='NAME',
+                       help='from where parallaxes are seen: earth, leo, l2, '
+                            'or a table of barycentric places x, y, z [au], '
+                            'one for each exposure or with their times')
     group.add_argument('--max-motion', type=tools.positive, default=50,
                        metavar='MAS/YR', help='largest motion considered in '
                        'matching (default: %(default)s)')
     group.add_argument('--match-radius', type=tools.positive, metavar='MAS',
                        help='largest distance of a match (default: from the '
                             'errors)')
-    group.add_argument('--good-flags', type=int, default=0, metavar='BITS',
-                       help='sum of the flags of detections to be used all '
-                            'the same')
+    group.add_argument('--good-flags', type=tools.not_negative,
+                       default=0, metavar='BITS', help='sum of the flags of '
+                       'detections to be used all the same')
     group.add_argument('--plane', action='store_true',
                        help='take pixels for coordinates, without WCS')
 
@@ -75,19 +96,39 @@ def run(options):
     folder = Path(options.output)
     are_tables = [is_table(path) for path in paths]
     names = _Names(folder, paths, are_tables, options.format)
-    tools.claim(names.all(), options.overwrite)
-    with tools.Progress(len(paths) + 2, options.quiet) as step:
-        epochs = _epochs(options, paths, are_tables, names, step)
+    read = tools.read_images(options, paths)
+    fitter = _fitter(options)
+    results = Results(options)
+    results.claim(names.all(), paths)
+    with Progress(1 + len(paths) + 2, options) as step:
+        step('look at all files')
+        epochs = [_from_catalogue(options, i) if are_tables[i]
+                  else _check_image(options, read(i))
+                  for i in range(len(paths))]
+        for i, path in enumerate(paths):
+            step(f'measure {path}' if epochs[i] is None else f'use {path}')
+            if epochs[i] is None:
+                epochs[i] = _from_image(options, read(i), names, i, results)
+            tools.say(options, f'{path}: {epochs[i]!r}')
         step('align and fit')
-        solution = _fit(epochs, options)
+        solution = fitter.fit(epochs)
         step(f'write to {folder}')
-        _write(solution, names, options)
+        _collect(solution, names, options, results)
+        # Nothing is written before all is well.
+        results.deliver()
     tools.say(options, *_summary(solution), f'files are in {folder}')
 
 
 def _check(options):
     """Raise for what is wrong before anything is read."""
-    tools.check_inputs([*options.inputs, *filter(None, [options.references])])
+    tools.check_inputs([*options.inputs, options.references, options.stars,
+                        options.parallax_of])
+    if options.parallax_of and (options.references or options.plane):
+        msg = ('--parallax-of must be given without --references and '
+               '--plane: its table has the references')
+        raise ValueError(msg)
+    tools.check_different(options.inputs)
+    check_observer(options.observer, len(options.inputs))
     if len(options.inputs) < 2:
         msg = (f'inputs must be at least 2 exposures, got only '
                f'{options.inputs[0]}')
@@ -105,7 +146,7 @@ def is_table(path):
     from photutils_mgauss.files.image_layers import is_asdf, open_fits
     if is_asdf(path):
         return False
-    with open_fits(path) as hdus:
+    with tools.about(path), open_fits(path) as hdus:
         images = [hdu for hdu in hdus if hdu.is_image
                   and hdu.header.get('NAXIS', 0) >= 2]
         return not images and len(hdus) > 1
@@ -137,38 +178,40 @@ def _where(chosen, names):
             for yes, name in zip(chosen, names, strict=True)]
 
 
-def _epochs(options, paths, are_tables, names, step):
-    read = tools.read_images(options, paths)
-    epochs = []
-    for i, path in enumerate(paths):
-        step(f'read {path}' if are_tables[i] else f'measure {path}')
-        if are_tables[i]:
-            epochs.append(_from_catalogue(options, i))
-        else:
-            epochs.append(_from_image(options, read(i), names, i))
-        tools.say(options, f'{path}: {epochs[-1]!r}')
-    return epochs
-
-
-def _from_image(options, image, names, i):
-    """Return the epoch of an image; write its PSF and catalogue."""
+def _check_image(options, image):
+    """Raise if an image cannot become an epoch."""
+    psf_command.check_image(image)
     if image.wcs is None and not options.plane:
         raise ValueError(_no_sky(image.path))
     if image.time is None:
         raise ValueError(_no_time(image.path))
-    psf, found = psf_command.from_stars(image, options)
-    psf_command.write(psf, names.psfs[i], tools.record_of(
-        options, input=str(image.path), **found))
-    table = photometry.measure(image, psf, options)
-    exposure = photometry.exposure(image, names.catalogues[i])
-    tools.write_table(table, names.catalogues[i],
-                      tools.record_of(options, exposure=exposure))
+
+
+def _from_image(options, image, names, i, results):
+    """Return the epoch of an image."""
+    key = results.key(file_marks(image.path, image.reading.wcs,
+                                 options.stars), image.content)
+    psf = results.obtain(names.psfs[i], key, partial(
+        psf_command.make, options, image), psf_command.read)
+    name = names.catalogues[i]
+    table = results.obtain(name, f'{key}_cat', partial(
+        photometry.make, options, image, psf, name), _read_table)
     return _epoch(options, image.path, table, image.wcs, image.time)
 
 
-def _from_catalogue(options, i):
+def _read_table(path):
     from photutils_mgauss.files.tables import read_table
+    return read_table(path)[0]
+
+
+def _from_catalogue(options, i):
     path = options.inputs[i]
+    with tools.about(path):
+        return _epoch_of_catalogue(options, path, i)
+
+
+def _epoch_of_catalogue(options, path, i):
+    from photutils_mgauss.files.tables import read_table
     table, record = read_table(path)
     exposure = record.get('exposure', {})
     time = tools.parse_time(tools.one_each(options.time, len(options.inputs),
@@ -208,11 +251,37 @@ def _epoch(options, path, table, wcs, time):
     wcs = None if options.plane else wcs
     if wcs is None and not options.plane:
         table = _on_the_sky(path, table)
-    try:
-        return Epoch(table, wcs, time, observer=options.observer)
-    except (TypeError, ValueError) as error:
-        msg = f'{path}: {error}'
-        raise ValueError(msg) from error
+    with tools.about(path):
+        observer = observer_at(options.observer, path, options.inputs,
+                               table['time'] if time is None else time)
+        if options.parallax_of:
+            table = _only_targets(options, path, table, time, observer)
+        return Epoch(table, wcs, time, observer=observer)
+
+
+@cache
+def _targets(path):
+    from photutils_mgauss.cli.targets import check_targets
+    from photutils_mgauss.files.tables import read_table
+    table, _ = read_table(path)
+    with tools.about(path):
+        check_targets(table)
+    return table
+
+
+def _only_targets(options, path, table, time, observer):
+    import numpy as np
+
+    from photutils_mgauss.cli.targets import only_targets
+    from photutils_mgauss.sky.observers import julian_years
+    years = julian_years(table['time'] if time is None else time)
+    if 'ra' not in table.colnames:
+        raise ValueError(_no_sky(path))
+    found, words = only_targets(table, _targets(options.parallax_of),
+                                float(np.nanmean(years)), observer,
+                                options.match_radius)
+    tools.say(options, *(f'{path}: {one}' for one in words))
+    return found
 
 
 def _usable(table, good_flags):
@@ -245,49 +314,84 @@ def _no_time(path):
     return f'{path}: the time must be known; its header has none, give --time'
 
 
-def _fit(epochs, options):
+def _fitter(options):
     import astropy.units as u
 
     from photutils_mgauss.motions import ProperMotionFitter
-    radius = options.match_radius
-    fitter = ProperMotionFitter(
-        transform=options.transform, recipe=options.recipe,
-        parallax=options.parallax, references=_references(options),
+    radius, alone = options.match_radius, options.parallax_of is not None
+    transform = options.transform or ('none' if alone else 'affine')
+    systematic = options.systematic
+    return ProperMotionFitter(
+        transform=None if transform == 'none' else transform,
+        recipe=options.recipe, parallax=alone or options.parallax,
+        references=_references(options), match_by='id' if alone else 'auto',
+        systematic='fit' if systematic is None else systematic * u.mas,
         max_motion=options.max_motion * u.mas / u.yr,
         match_radius=None if radius is None else radius * u.mas)
-    return fitter.fit(epochs)
 
 
 def _references(options):
+    if options.parallax_of is not None:
+        from photutils_mgauss.cli.targets import without_parallax
+        return without_parallax(_targets(options.parallax_of))
     if options.references is None:
         return None
     from photutils_mgauss.files.tables import read_table
+    from photutils_mgauss.motions.references import read_catalogue
+    from photutils_mgauss.sky.tangent_plane import TangentPlane
     table, _ = read_table(options.references)
     if options.reference_class is not None:
         table['class'] = options.reference_class
     # Identifiers of another catalogue say nothing about these stars.
-    return table[[name for name in table.colnames if name != 'id']]
+    table = table[[name for name in table.colnames if name != 'id']]
+    with tools.about(options.references):
+        # Whether it can be used is found out before anything is measured.
+        if options.plane:
+            read_catalogue(table, None, 'pix')
+        else:
+            read_catalogue(table, TangentPlane(0.0, 0.0), 'mas')
+    return table
 
 
-def _write(solution, names, options):
+def _collect(solution, names, options, results):
+    """Obtain the tables and the WCS."""
+    key = results.key(_content(solution))
     for name, path in names.tables.items():
         table = getattr(solution, 'stars' if name == 'motions' else name)
-        tools.write_table(table, path, tools.record_of(
+        write = partial(tools.write_table, table, record=tools.record_of(
             options, notes=list(solution.notes)))
-    for epoch, name in zip(solution.epochs, names.wcs, strict=True):
+        results.obtain(path, f'{key}_{name}', partial(_made, table, write))
+    for i, (epoch, name) in enumerate(zip(solution.epochs, names.wcs,
+                                          strict=True)):
         if epoch.wcs is not None:
-            write_wcs(epoch, name, tools.record_of(options))
+            suffix, write = wcs_writer(epoch, tools.record_of(options))
+            results.obtain(name.with_suffix(suffix), f'{key}_wcs{i}',
+                           partial(_made, epoch.wcs, write))
 
 
-def write_wcs(epoch, name, record):
-    """Write a WCS: a gwcs as ASDF, any other as a FITS header."""
+def _made(result, write):
+    return result, write
+
+
+def _content(solution):
+    """Return the numbers of a solution, by which it is known again."""
+    import numpy as np
+    return [[np.asarray(getattr(column, 'value', column))
+             for column in table.itercols()] for table in (
+                 solution.stars, solution.alignment, solution.residuals)]
+
+
+def wcs_writer(epoch, record):
+    """
+    Return the suffix of a WCS, and what writes it.
+
+    A gwcs is written as ASDF, any other as a FITS header.
+    """
     from gwcs import WCS as GWCS
     if isinstance(epoch.wcs, GWCS):
         import asdf
-        with tools.whole_file(name.with_suffix('.asdf')) as draft:
-            asdf.AsdfFile({'wcs': epoch.wcs, 'mgauss': record}).write_to(
-                draft)
-        return
+        return '.asdf', asdf.AsdfFile({'wcs': epoch.wcs,
+                                       'mgauss': record}).write_to
     from astropy.io import fits
 
     from photutils_mgauss.sky.observers import tdb
@@ -295,8 +399,7 @@ def write_wcs(epoch, name, record):
     header['MJD-AVG'] = tdb(epoch.mean_year).mjd, 'middle of the exposure'
     header['TIMESYS'] = 'TDB'
     header['MGRUN'] = json.dumps(record)
-    with tools.whole_file(name.with_suffix('.fits')) as draft:
-        fits.PrimaryHDU(header=header).writeto(draft)
+    return '.fits', fits.PrimaryHDU(header=header).writeto
 
 
 def _summary(solution):
@@ -309,4 +412,32 @@ def _summary(solution):
     if solved.any():
         median = np.median([error.value[solved] for error in errors])
         lines.append(f'median error {median:.3g} {errors[0].unit}')
+    lines += _parallaxes(stars)
+    _check_scatter(solution)
     return [*lines, *(f'note: {note}' for note in solution.notes)]
+
+
+def _parallaxes(stars):
+    """Return a line for each parallax, if there are only a few."""
+    import numpy as np
+    if 'parallax' not in stars.colnames:
+        return []
+    known = stars[np.isfinite(stars['parallax_error'].value)]
+    return [f'parallax of {star["id"]}: {star["parallax"].value:.3f} +- '
+            f'{star["parallax_error"]:.3f}'
+            for star in known] if len(known) <= _FEW else []
+
+
+def _check_scatter(solution):
+    """Warn if the detections scatter more than their errors allow."""
+    import numpy as np
+    rows = solution.residuals
+    pulls = np.concatenate([(rows[name] / rows[f'{name}_error']).value
+                            for name in ('dra', 'ddec')])
+    pulls = pulls[np.isfinite(pulls) & (pulls != 0)]
+    scatter = np.sqrt(np.mean(pulls**2)) if pulls.size else 0
+    if len(solution.stars) <= _FEW and scatter > _TOO_MUCH:
+        warnings.warn(
+            f'positions scatter {scatter:.3g} times as much as their errors '
+            'allow, and so may the results; give --systematic, the error of '
+            'an exposure', UserWarning, stacklevel=2)

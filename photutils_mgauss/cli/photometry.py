@@ -1,10 +1,20 @@
 """``mgauss photometry``: images and PSFs to catalogues."""
 import os
+import warnings
+from functools import partial
 from pathlib import Path
 
+from photutils_mgauss.cli import psf as psf_command
 from photutils_mgauss.cli import tools
+from photutils_mgauss.cli.progress import Progress
+from photutils_mgauss.cli.results import Results, add_checkpoint, file_marks
 
 _SUFFIXES = ('.ecsv', '.fits')
+
+# Stars of a larger signal-to-noise ratio should not have, in the median, a
+# larger reduced chi2.
+_BRIGHT = 100.0
+_BAD_CHI2 = 5.0
 
 # Columns in the unit of the image.
 _FLUXES = ('flux_init', 'flux_fit', 'flux_err', 'local_bkg', 'sky',
@@ -16,7 +26,7 @@ def add(commands):
     parser = tools.command(
         commands, 'photometry', 'positions and fluxes of the stars in images',
         'Find the stars of each image and fit their positions and fluxes. '
-        "The catalogue has\nphotutils' columns and, if the image has a WCS, "
+        "The catalogue has photutils' columns and, if the image has a WCS, "
         'places on the sky with covariances.',
         'mgauss photometry night1.fits --psf night1_psf.fits', run)
     tools.add_inputs(parser, 'IMAGE', 'images')
@@ -29,7 +39,8 @@ def add(commands):
     add_measuring(parser)
     tools.add_times(parser)
     tools.add_reading(parser)
-    tools.add_common(parser)
+    add_checkpoint(parser)
+    tools.add_overwrite(parser)
 
 
 def add_measuring(parser):
@@ -49,43 +60,73 @@ def run(options):
     """Measure the images."""
     paths = options.inputs
     tools.check_inputs([*paths, *options.psf])
+    tools.check_different(paths)
     names = tools.output_names(paths, options.output, '_cat', _SUFFIXES,
                                '.ecsv')
-    psfs = tools.one_each(options.psf, len(paths), 'psf')
-    tools.claim(names, options.overwrite)
+    owners = tools.one_each(options.psf, len(paths), 'psf')
     read = tools.read_images(options, paths)
-    with tools.Progress(3 * len(names), options.quiet) as step:
+    results = Results(options)
+    results.claim(names, [*paths, *options.psf])
+    with Progress(1 + len(names), options) as step:
+        step('look at all files')
+        psfs = {path: _read_psf(path, options.checkpoint)
+                for path in dict.fromkeys(owners)}
+        for i in range(len(paths)):
+            psf_command.check_image(read(i))
         for i, name in enumerate(names):
-            step(f'read {paths[i]}')
-            image, psf = read(i), _read_psf(psfs[i])
-            tools.say(options, image.describe())
             step(f'measure {paths[i]}')
-            table = measure(image, psf, options)
-            step(f'write {name}')
-            record = tools.record_of(options, exposure=exposure(image, name),
-                                     psf=str(psfs[i]),
-                                     reading=image.layers.sources)
-            tools.write_table(table, name, record)
-            tools.say(options, f'{name}: {len(table)} stars')
+            image = read(i)
+            key = results.key(file_marks(paths[i], owners[i],
+                                         image.reading.wcs), image.content)
+            results.obtain(name, key, partial(
+                make, options, image, psfs[owners[i]], name,
+                psf=str(owners[i])))
+            results.deliver()
+            tools.say(options, f'{name} is written')
 
 
-def _read_psf(path):
+def _read_psf(path, checkpoint):
     from photutils_mgauss.cli.psf_files import read_psf
-    return read_psf(path)
+    with tools.about(path):
+        return read_psf(path, checkpoint=checkpoint)
+
+
+def make(options, image, model, name, **more):
+    """Return the catalogue of an image, and what writes it."""
+    tools.say(options, image.describe())
+    table = measure(image, model, options)
+    tools.say(options, f'{image.path}: {len(table)} stars')
+    return table, partial(tools.write_table, table, record=tools.record_of(
+        options, exposure=exposure(image, name),
+        reading=image.layers.sources, **more))
 
 
 def measure(image, psf, options):
     """Return the catalogue of an image."""
-    try:
+    with tools.about(image.path):
         table = (_crowded if options.crowded else _sparse)(image, psf,
                                                            options)
-    except ValueError as error:
-        msg = f'{image.path}: {error}'
-        raise ValueError(msg) from error
-    if table is None or len(table) == 0:
-        msg = f'{image.path}: must show a star, got none; try --threshold'
-        raise ValueError(msg)
-    return _with_sky(_with_unit(table, image.unit), image)
+        if table is None or len(table) == 0:
+            msg = 'must show a star, got none; try --threshold'
+            raise ValueError(msg)
+        _check_fits(image, table)
+        return _with_sky(_with_unit(table, image.unit), image)
+
+
+def _check_fits(image, table):
+    """Warn if the PSF does not describe the bright stars."""
+    import numpy as np
+    if 'reduced_chi2' not in table.colnames:
+        return
+    signal = table['flux_fit'] / table['flux_err']
+    chi2 = np.asarray(table['reduced_chi2'])[
+        (signal > _BRIGHT) & np.isfinite(table['reduced_chi2'])]
+    if chi2.size and np.median(chi2) > _BAD_CHI2:
+        warnings.warn(
+            f'{image.path}: the PSF does not describe the {chi2.size} '
+            f'brightest stars (median reduced chi2 {np.median(chi2):.3g}); '
+            'their errors do not contain that of the PSF', UserWarning,
+            stacklevel=2)
 
 
 def _sparse(image, psf, options):
@@ -109,7 +150,7 @@ def _crowded(image, psf, options):
     from photutils_mgauss.crowded.photometry import CrowdedMixturePhotometry
     photometry = CrowdedMixturePhotometry(
         psf, threshold=options.threshold or 4.5,
-        effective_gain=image.noise.gain)
+        effective_gain=image.noise.gain, checkpoint=options.checkpoint)
     return photometry(image.data, error=image.noise.total, mask=image.mask)
 
 

@@ -1,5 +1,9 @@
 """``mgauss psf``: images or PSF files to grids of mixtures."""
+from functools import partial
+
 from photutils_mgauss.cli import tools
+from photutils_mgauss.cli.progress import Progress
+from photutils_mgauss.cli.results import Results, add_checkpoint, file_marks
 
 _SUFFIXES = ('.fits', '.asdf')
 
@@ -11,8 +15,8 @@ def add(commands):
     parser = tools.command(
         commands, 'psf', "make a PSF of an image's own stars, or of a PSF "
         'file', 'Make a grid of Gaussian mixtures for each input. Of an '
-        "image, it is made of\nthe image's own stars; PSFEx models, STDPSF "
-        'and STPSF grids and ePSFs (images\nwith the keyword OVERSAMP) are '
+        "image, it is made of the image's own stars; PSFEx models, STDPSF "
+        'and STPSF grids and ePSFs (images with the keyword OVERSAMP) are '
         'fitted.', 'mgauss psf night1.fits night2.fits --output psfs',
         run)
     tools.add_inputs(parser, 'FILE', 'images or PSF files')
@@ -25,7 +29,8 @@ def add(commands):
     add_fit(parser)
     _add_files(parser)
     tools.add_reading(parser)
-    tools.add_common(parser)
+    add_checkpoint(parser)
+    tools.add_overwrite(parser)
 
 
 def add_fit(parser):
@@ -61,31 +66,77 @@ def _add_files(parser):
 
 def run(options):
     """Make the PSFs."""
-    tools.check_inputs(options.inputs)
-    names = tools.output_names(options.inputs, options.output, '_psf',
-                               _SUFFIXES, '.fits')
-    tools.claim(names, options.overwrite)
-    read = tools.read_images(options, options.inputs)
-    with tools.Progress(2 * len(names), options.quiet) as step:
-        for i, (path, name) in enumerate(zip(options.inputs, names,
-                                             strict=True)):
-            psf, found = _make(options, path, lambda i=i: read(i), step)
-            write(psf, name, tools.record_of(options, input=path, **found))
-            tools.say(options, f'{name}: {_describe(psf, found)}')
+    paths = options.inputs
+    tools.check_inputs([*paths, options.stars])
+    tools.check_different(paths)
+    names = tools.output_names(paths, options.output, '_psf', _SUFFIXES,
+                               '.fits')
+    read = tools.read_images(options, paths)
+    results = Results(options)
+    results.claim(names, paths)
+    with Progress(1 + len(names), options) as step:
+        step('look at all files')
+        kinds = [_kind(options, path, lambda i=i: read(i))
+                 for i, path in enumerate(paths)]
+        for i, (path, name) in enumerate(zip(paths, names, strict=True)):
+            step(f'PSF of {path}')
+            image = read(i) if kinds[i] == 'image' else None
+            key = results.key(file_marks(path, options.stars),
+                              image and image.content)
+            results.obtain(name, key, partial(_make, options, path, image,
+                                              kinds[i]))
+            results.deliver()
+            tools.say(options, f'{name} is written')
 
 
-def _make(options, path, read, step):
-    """Return the grid of one input, and what is to be said of it."""
+def _kind(options, path, read):
+    """Return what an input is; raise if it is nothing to make a PSF of."""
     from photutils_mgauss.cli.psf_files import psf_kind
-    step(f'read {path}')
-    kind = psf_kind(path)
-    if kind == 'image' and options.oversampling is None:
-        image = read()
+    with tools.about(path):
+        kind = psf_kind(path)
+    if kind != 'image':
+        if options.n_components == 'auto':
+            msg = f'{path}: --n-components must be a number for PSF files'
+            raise ValueError(msg)
+        return kind
+    if options.oversampling is not None:
+        return 'epsf'
+    check_image(read())
+    return kind
+
+
+def check_image(image):
+    """Raise if an image cannot be measured, and before any is."""
+    with tools.about(image.path):
+        image.check()
+
+
+def _make(options, path, image, kind):
+    """Return the grid of one input, and what writes it."""
+    if image is not None:
         tools.say(options, image.describe())
-        step('PSF from stars')
-        return from_stars(image, options)
-    step(f'fit {path}')
-    return from_file(path, options), {'kind': kind}
+        return make(options, image)
+    return _with_writer(options, path, from_file(path, options),
+                        {'kind': kind})
+
+
+def read(path):
+    """Read a PSF that was written before."""
+    from photutils_mgauss.cli.psf_files import read_psf
+    with tools.about(path):
+        return read_psf(path)
+
+
+def make(options, image):
+    """Return the PSF of an image's own stars, and what writes it."""
+    return _with_writer(options, image.path, *from_stars(image, options))
+
+
+def _with_writer(options, path, psf, found):
+    from photutils_mgauss.cli.psf_files import write_psf
+    tools.say(options, f'{path}: {_describe(psf, found)}')
+    return psf, partial(write_psf, psf, record=tools.record_of(
+        options, input=str(path), **found))
 
 
 def from_file(path, options):
@@ -95,16 +146,22 @@ def from_file(path, options):
     if number == 'auto':
         msg = f'{path}: --n-components must be a number for PSF files'
         raise ValueError(msg)
-    return read_psf(path, n_components=number,
-                    grid_shape=tuple(options.grid_shape),
-                    radius=options.radius, ext=options.ext,
-                    detector=options.detector,
-                    oversampling=options.oversampling,
-                    progress_bar=not options.quiet)
+    with tools.about(path):
+        return read_psf(path, n_components=number,
+                        grid_shape=tuple(options.grid_shape),
+                        radius=options.radius, ext=options.ext,
+                        detector=options.detector,
+                        oversampling=options.oversampling,
+                        checkpoint=options.checkpoint)
 
 
 def from_stars(image, options):
     """Return the grid of an image's own stars, and facts about it."""
+    with tools.about(image.path):
+        return _from_stars(image, options)
+
+
+def _from_stars(image, options):
     from photutils_mgauss.field.fit import fit_mixture_field
     given = {name: getattr(options, name)
              for name in ('n_components', 'degree', 'radius')}
@@ -134,14 +191,10 @@ def _choose(image, radius, options):
     if saturation is not None:
         # The level is that of the image with its sky.
         saturation -= float(image.sky.background_median)
-    try:
-        stars = select_psf_stars(
-            image.without_sky, sources, error=image.noise.total,
-            mask=image.mask, radius=radius, saturation=saturation,
-            min_snr=options.min_snr, max_stars=options.max_stars)
-    except ValueError as error:
-        msg = f'{image.path}: {error}'
-        raise ValueError(msg) from error
+    stars = select_psf_stars(
+        image.without_sky, sources, error=image.noise.total, mask=image.mask,
+        radius=radius, saturation=saturation, min_snr=options.min_snr,
+        max_stars=options.max_stars)
     if not stars['selected'].any():
         raise ValueError(_no_stars(image, stars))
     return stars
@@ -154,13 +207,6 @@ def _no_stars(image, stars):
                        for reason in sorted(set(reasons)))
     return (f'{image.path}: must have at least 1 star good for the PSF, got '
             f'none of {len(stars)}: {counts}; try --min-snr or --radius')
-
-
-def write(psf, name, record):
-    """Write a grid, whole or not at all."""
-    from photutils_mgauss.cli.psf_files import write_psf
-    with tools.whole_file(name) as draft:
-        write_psf(psf, draft, record)
 
 
 def _describe(psf, found):

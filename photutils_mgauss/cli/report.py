@@ -3,6 +3,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from photutils_mgauss.cli import tools
+from photutils_mgauss.cli.progress import Progress
 
 
 def add(commands):
@@ -10,7 +11,7 @@ def add(commands):
     parser = tools.command(
         commands, 'report', 'figures and a page of HTML of results',
         'Show PSFs, catalogues and proper motions on one page of HTML, which '
-        'has its figures\ninside and needs no other file.',
+        'has its figures inside and needs no other file.',
         'mgauss report night1_psf.fits night1_cat.ecsv mgauss_motions '
         '--output report.html', run)
     tools.add_inputs(parser, 'PATH',
@@ -19,7 +20,7 @@ def add(commands):
                         metavar='FILE', help='default: %(default)s')
     parser.add_argument('--title', default='Positions and proper motions',
                         help='of the page (default: %(default)s)')
-    tools.add_common(parser)
+    tools.add_overwrite(parser)
 
 
 def run(options):
@@ -28,10 +29,11 @@ def run(options):
     if output.suffix not in ('.html', '.htm'):
         msg = f'{output}: --output must end with .html'
         raise ValueError(msg)
+    tools.check_different(options.inputs)
     paths = _files(options.inputs)
-    tools.claim([output], options.overwrite)
+    tools.claim([output], options.overwrite, options.inputs)
     _check_matplotlib()
-    with tools.Progress(len(paths) + 1, options.quiet) as step:
+    with Progress(len(paths) + 1, options) as step:
         sections = [_section(path, named, step) for path, named in paths]
         sections = [section for section in sections if section is not None]
         if not sections:
@@ -65,7 +67,8 @@ def _files(inputs):
 def _section(path, named, step):
     from photutils_mgauss.cli.sections import section_of
     step(f'read {path}')
-    section = section_of(path)
+    with tools.about(path):
+        section = section_of(path)
     if section is None and named:
         msg = (f'{path}: must be a PSF, a catalogue, proper motions, an '
                'alignment or residuals')

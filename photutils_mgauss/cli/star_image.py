@@ -26,15 +26,19 @@ class Reading:
     """
     How an image is to be read; what is None is left to its files.
 
-    ``ext`` is the extension, ``error``, ``weight``, ``flags`` and ``wcs``
-    are files beside the image. ``good_bits`` are the bits of the flags that
-    do not make a pixel bad, ``gain`` the electrons in a count (or in a unit
-    that is no count), ``read_noise`` in electrons, ``exposure_time`` in
-    seconds, ``saturation`` in the image's unit, ``time`` the middle of the
-    exposure, ``sky_box`` the side of the boxes of the sky in pixels.
+    ``ext``, ``error_ext`` and ``flags_ext`` are extensions; ``error``,
+    ``weight``, ``flags`` and ``wcs`` are files beside the image.
+    ``good_bits`` are the bits of the flags that do not make a pixel bad,
+    ``gain`` the electrons in a count (or in a unit that is no count),
+    ``read_noise`` in electrons, ``exposure_time`` in seconds, ``saturation``
+    in the image's unit, ``time`` the middle of the exposure, ``time_key`` a
+    keyword that has it, ``sky_box`` the side of the boxes of the sky in
+    pixels.
     """
 
     ext: str | None = None
+    error_ext: str | None = None
+    flags_ext: str | None = None
     error: str | None = None
     weight: str | None = None
     flags: str | None = None
@@ -45,6 +49,7 @@ class Reading:
     exposure_time: float | None = None
     saturation: float | None = None
     time: object = None
+    time_key: str | None = None
     sky_box: int = 128
 
 
@@ -96,6 +101,12 @@ class StarImage:
         """The unit of the values, or None."""
         return self.layers.cards.unit
 
+    @property
+    def content(self):
+        """What a measurement depends on, besides its options."""
+        return [self.data, self.layers.error, self.mask, self.electrons,
+                self.saturation]
+
     @cached_property
     def wcs(self):
         """The WCS, or None."""
@@ -108,6 +119,8 @@ class StarImage:
         """The middle of the exposure, or None."""
         if self.reading.time is not None:
             return self.reading.time
+        if self.reading.time_key is not None:
+            return self.layers.cards.time_at(self.reading.time_key)
         return self.layers.cards.time
 
     @property
@@ -173,6 +186,12 @@ class StarImage:
                 f'{unit} it takes --gain (electrons in a count or unit) and, '
                 f'for rates, --exposure-time')
 
+    def check(self):
+        """Raise if the image lacks what it takes to measure it."""
+        if self.layers.error is None and self.electrons is None:
+            raise ValueError(self._no_noise())
+        self.wcs, self.time  # noqa: B018 whether they can be read
+
     def describe(self):
         """Return a sentence on what was read."""
         ny, nx = self.data.shape
@@ -213,5 +232,6 @@ def read_image(path, reading=None):
     reading = Reading() if reading is None else reading
     beside = {kind: getattr(reading, kind)
               for kind in ('error', 'weight', 'flags')}
-    layers = read_layers(path, ext=reading.ext, beside=beside)
+    layers = read_layers(path, ext=reading.ext, error_ext=reading.error_ext,
+                         flags_ext=reading.flags_ext, beside=beside)
     return StarImage(path, layers, reading)

@@ -1,63 +1,47 @@
-"""What all commands share: options, progress, files, and records of runs."""
+"""What all commands share: options, files, words, and records of runs."""
 import argparse
 import json
+import logging
 import os
 import re
 import sys
+import textwrap
 import warnings
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from tqdm import tqdm
 
 from photutils_mgauss import __version__
-from photutils_mgauss.files.whole import whole_file
+from photutils_mgauss.files import whole
 
 # What is no option of a run.
-_NOT_STORED = ('run', 'quiet', 'overwrite')
+NOT_STORED = ('run', 'parser', 'quiet', 'log_file', 'overwrite')
+# What is wrong is said in no more letters than these.
+_LONGEST = 500
+# Errors of these kinds are sentences already.
+_WORDED = (OSError, ValueError, TypeError, RuntimeError)
+# Files that are being written.
+_DRAFTS = set()
 
 
-class Progress:
-    """
-    A bar that moves on with each step of a command.
-
-    Parameters
-    ----------
-    total : int
-        The number of steps.
-    quiet : bool
-        Whether to show nothing.
-    """
-
-    def __init__(self, total, quiet):
-        self._bar = tqdm(total=total, disable=quiet, unit='step',
-                         bar_format='{desc}{bar:20} {n_fmt}/{total_fmt} '
-                                    '[{elapsed}]')
-        self._begun = False
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, kind, error, trace):
-        if kind is None:
-            self._bar.update(self._begun)
-        self._bar.close()
-
-    def __call__(self, words):
-        """Say what is done next; what was begun before is finished."""
-        self._bar.set_description_str(f'{words:40.40} ', refresh=False)
-        self._bar.update(self._begun)
-        self._bar.refresh()
-        self._begun = True
+LOG = logging.getLogger('mgauss')
 
 
 def command(commands, name, words, description, example, run):
     """Add a command with its help; return its parser."""
     parser = commands.add_parser(
-        name, help=words, description=description,
+        name, help=words, description=textwrap.fill(description, 78),
         epilog='example: ' + example,
         formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.set_defaults(run=run)
+    parser.add_argument('--quiet', action='store_true',
+                        help='no progress bars and no messages')
+    parser.add_argument('--log-file', metavar='FILE',
+                        help='file to which everything is added that is said, '
+                             'with times')
+    parser.set_defaults(run=run, parser=parser)
     return parser
 
 
@@ -72,29 +56,32 @@ def add_folder(parser, default):
                         help='where files go (default: %(default)s)')
 
 
-def add_common(parser):
-    """Add the options that every command has."""
+def add_overwrite(parser):
+    """Add the option of every command that writes files."""
     parser.add_argument('--overwrite', action='store_true',
                         help='replace files of an earlier run')
-    parser.add_argument('--quiet', action='store_true',
-                        help='no progress bars and no messages')
 
 
 def add_reading(parser):
     """Add the options that say how images are read."""
     group = parser.add_argument_group(
-        'reading images', 'What is not given is taken from the files: their '
-        'extensions SCI, ERR and DQ, their headers, and files beside them '
-        'with names in _err, _wht or _flg. Options with FILE take one for '
-        'all images or one for each.')
+        'reading images', textwrap.fill(
+            'What is not given is taken from the files: their extensions SCI, '
+            'ERR and DQ, their headers, and files beside them with names in '
+            '_err, _wht or _flg. Options with FILE take one for all images '
+            'or one for each.', 76))
     group.add_argument('--ext', metavar='NAME',
                        help='extension with the image: 1, SCI or SCI,2')
+    group.add_argument('--error-ext', metavar='NAME',
+                       help='extension with the errors')
+    group.add_argument('--flags-ext', metavar='NAME',
+                       help='extension with the flags of bad pixels')
     for name, words in (('error', 'standard deviations of the pixels'),
                         ('weight', 'inverse variances of the pixels'),
                         ('flags', 'flags of bad pixels'),
                         ('wcs', 'WCS, as ASDF or FITS header')):
         group.add_argument(f'--{name}', nargs='+', metavar='FILE', help=words)
-    group.add_argument('--good-bits', type=int, metavar='BITS',
+    group.add_argument('--good-bits', type=not_negative, metavar='BITS',
                        help='sum of the bits of the flags that do not make '
                             'a pixel bad')
     group.add_argument('--gain', type=positive,
@@ -117,36 +104,100 @@ def add_times(parser):
     parser.add_argument('--time', nargs='+', metavar='TIME',
                         help='middle of each exposure, as 2027-03-14T15:09 '
                              '(UTC) or as a Julian year, 2027.2')
+    parser.add_argument('--time-key', metavar='KEYWORD',
+                        help='keyword of the header with the middle of the '
+                             'exposure, a date, a Julian date or a year')
 
 
 def positive(text):
     """Return a positive number, for argparse."""
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
     if not 0 < value < float('inf'):
-        msg = f'must be positive, got {text}'
+        msg = f'must be a positive number, got {text}'
         raise argparse.ArgumentTypeError(msg)
     return value
 
 
 def count(text):
     """Return a whole number from 1, for argparse."""
-    value = int(text)
-    if value < 1:
-        msg = f'must be at least 1, got {text}'
-        raise argparse.ArgumentTypeError(msg)
-    return value
+    return _whole_number(text, 1)
+
+
+def not_negative(text):
+    """Return a whole number from 0, for argparse."""
+    return _whole_number(text, 0)
 
 
 def number_or_auto(text):
     """Return a whole number or 'auto', for argparse."""
     if text == 'auto':
         return text
-    value = int(text)
-    if value < 0:
-        msg = f'must not be negative, got {text}'
+    return _whole_number(text, 0, ' or auto')
+
+
+def _whole_number(text, least, more=''):
+    try:
+        value = int(text)
+    except ValueError:
+        value = least - 1
+    if value < least:
+        msg = f'must be a whole number from {least}{more}, got {text}'
         raise argparse.ArgumentTypeError(msg)
     return value
 
+
+# What is said.
+
+def one_line(text):
+    """Return words on one line, and not too many."""
+    text = ' '.join(text.split())
+    return text if len(text) <= _LONGEST else text[:_LONGEST - 4] + ' ...'
+
+
+def sentence_of(error):
+    """Return what went wrong as one sentence, whatever the error is."""
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return one_line(f'{error.filename}: {error.strerror}')
+    if isinstance(error, MemoryError):
+        return one_line(f'there is not enough memory. {error}')
+    # The text of a KeyError is how its key looks in code.
+    text = one_line(str(error.args[0] if isinstance(error, KeyError)
+                        and error.args else error))
+    if isinstance(error, _WORDED) and text:
+        return text
+    return f'{type(error).__name__}: {text}'
+
+
+@contextmanager
+def about(path):
+    """Have whatever goes wrong inside name the file that it is about."""
+    try:
+        yield
+    except Exception as error:
+        words = sentence_of(error)
+        if str(path) in words:
+            raise
+        # Readers raise what they please.
+        msg = f'{path}: {words}'
+        raise ValueError(msg) from error
+
+
+def say(options, *lines):
+    """Print lines unless the user wants it quiet."""
+    for line in lines:
+        LOG.info('%s', line)
+        if not options.quiet:
+            try:
+                tqdm.write(str(line), file=sys.stdout)
+            except BrokenPipeError:
+                # Who read this has gone; the work goes on.
+                os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
+# What is given.
 
 def one_each(values, n, name):
     """Return n values of an option that has none, one for all, or n."""
@@ -162,7 +213,7 @@ def one_each(values, n, name):
 
 def check_inputs(paths):
     """Raise if a file is missing, before anything is computed."""
-    for path in paths:
+    for path in filter(None, paths):
         if not Path(path).exists():
             msg = f'{path}: must be a file, but there is none of this name'
             raise FileNotFoundError(msg)
@@ -171,22 +222,37 @@ def check_inputs(paths):
             raise IsADirectoryError(msg)
 
 
+def check_different(paths):
+    """Raise if a file is given twice."""
+    known = {}
+    for path in paths:
+        first = known.setdefault(Path(path).resolve(), path)
+        if first is not path:
+            msg = f'{path}: must be given only once, got it twice'
+            raise ValueError(msg)
+
+
 def read_images(options, paths):
     """Return a function that reads image i as the options say."""
     from photutils_mgauss.cli.star_image import Reading, read_image
     n = len(paths)
     files = {name: one_each(getattr(options, name), n, name)
              for name in ('error', 'weight', 'flags', 'wcs')}
+    for some in files.values():
+        check_inputs(some)
     times = [parse_time(text) for text in
              one_each(getattr(options, 'time', None), n, 'time')]
     common = {name: getattr(options, name) for name in (
-        'ext', 'good_bits', 'gain', 'read_noise', 'exposure_time',
-        'saturation', 'sky_box')}
+        'ext', 'error_ext', 'flags_ext', 'good_bits', 'gain', 'read_noise',
+        'exposure_time', 'saturation', 'sky_box')}
+    common['time_key'] = getattr(options, 'time_key', None)
 
     def read(i):
+        """Read an image."""
         beside = {name: some[i] for name, some in files.items()}
-        return read_image(paths[i], Reading(**beside, **common,
-                                            time=times[i]))
+        with about(paths[i]):
+            return read_image(paths[i], Reading(**beside, **common,
+                                                time=times[i]))
     return read
 
 
@@ -245,30 +311,115 @@ def stem(path):
     return name
 
 
-def claim(paths, overwrite):
-    """Raise unless files can be written there, and none is replaced."""
+def claim(paths, overwrite, inputs=()):
+    """
+    Raise unless files can be written there, and none is replaced.
+
+    Nothing is made: a file or a folder appears when there is something to
+    write into it.
+    """
     for path in paths:
+        _check_name(path)
+        for source in map(Path, inputs):
+            if path.exists() and path.samefile(source):
+                msg = f'{path}: --output must not be an input'
+                raise ValueError(msg)
         if path.exists() and not overwrite:
             msg = f'{path} exists; choose another --output or add --overwrite'
             raise FileExistsError(msg)
     for folder in {path.parent for path in paths}:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK | os.X_OK):
-            msg = f'{folder}: must be a folder that can be written to'
-            raise PermissionError(msg)
+        check_folder(folder)
+
+
+def _check_name(path):
+    """Raise if there can be no file of this name."""
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    if path.is_dir():
+        msg = f'{path}: must be the name of a file, but is a folder'
+        raise IsADirectoryError(msg)
+
+
+def check_folder(folder):
+    """Raise unless files can be written into a folder, or it can be made."""
+    nearest = next(one for one in (folder, *folder.parents) if one.exists())
+    if not nearest.is_dir():
+        msg = f'{folder}: must be a folder, but {nearest} is a file'
+        raise NotADirectoryError(msg)
+    try:
+        # Permissions do not say all: a file system may be read-only.
+        with TemporaryFile(dir=nearest):
+            pass
+    except OSError as error:
+        msg = (f'{folder}: must be a folder that can be written to, got: '
+               f'{error.strerror}')
+        raise PermissionError(msg) from error
+
+
+class _Draft:
+    """A file that is being written, and the folders made for it."""
+
+    def __init__(self, path):
+        self.name = None
+        self._made = [folder for folder in path.parents
+                      if not folder.exists()]
+
+    def clear(self):
+        """Leave nothing behind but what other files need."""
+        if self.name is not None:
+            self.name.unlink(missing_ok=True)
+        with suppress(OSError):
+            for folder in self._made:
+                folder.rmdir()
+
+
+@contextmanager
+def whole_file(path):
+    """
+    Give a name to write to; the file gets its own name once it is whole.
+
+    As `photutils_mgauss.files.whole.whole_file`. Folders are made, and go
+    again if nothing comes into them.
+    """
+    path = Path(path)
+    draft = _Draft(path)
+    _DRAFTS.add(draft)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole.whole_file(path) as name:
+            if name.name != path.name:
+                draft.name = name
+            yield name
+    except Exception as error:
+        words = sentence_of(error).replace(str(draft.name), str(path))
+        if words == sentence_of(error) and not isinstance(error, OSError):
+            raise
+        msg = f'{path}: could not be written: {words}'
+        raise OSError(msg) from error
+    finally:
+        draft.clear()
+        _DRAFTS.discard(draft)
+
+
+def clear_up():
+    """Remove the files that are being written, of a run that is given up."""
+    for draft in list(_DRAFTS):
+        draft.clear()
 
 
 def record_of(options, **more):
     """Return what is stored with results: command, options, version, date."""
     used = {name: value for name, value in vars(options).items()
-            if name not in _NOT_STORED}
+            if name not in (*NOT_STORED, 'checkpoint')}
     return {'command': used.pop('command'), 'version': __version__,
             'date': datetime.now(UTC).isoformat(timespec='seconds'),
             'options': used, **more}
 
 
 def write_table(table, path, record):
-    """Write a table with the record of its run, as ECSV or FITS."""
+    """Write a table with the record of its run into an ECSV or FITS file."""
     table = table.copy()
     if path.suffix == '.fits':
         kept = {key: value for key, value in table.meta.items()
@@ -276,14 +427,7 @@ def write_table(table, path, record):
         table.meta = {**kept, 'MGRUN': json.dumps(record)}
     else:
         table.meta['mgauss'] = record
-    with whole_file(path) as draft, warnings.catch_warnings():
+    with warnings.catch_warnings():
         # FITS has no electrons; astropy notes them down all the same.
         warnings.filterwarnings('ignore', 'The unit .* could not be saved')
-        table.write(draft)
-
-
-def say(options, *lines):
-    """Print lines unless the user wants it quiet."""
-    if not options.quiet:
-        for line in lines:
-            tqdm.write(str(line), file=sys.stdout)
+        table.write(path)

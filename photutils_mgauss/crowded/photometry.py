@@ -22,6 +22,7 @@ from photutils_mgauss.crowded.table import (
 from photutils_mgauss.crowded.tile import TileOptions
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.psf.renderer import MixtureRenderer
+from photutils_mgauss.utils.checkpoint import Checkpoint
 from photutils_mgauss.utils.flags import REPEATED, decode
 from photutils_mgauss.utils.image import read_pixels, with_unit
 from photutils_mgauss.utils.per_thread import PerThread, keep
@@ -142,6 +143,9 @@ class CrowdedMixturePhotometry:
         Where tiles are solved; by default a pool of threads on all cores.
     progress_bar : bool, optional
         Whether to show a bar with the stars found and their chi2.
+    checkpoint : str or path-like, optional
+        A folder in which finished tiles are kept. A call with the same image
+        and settings takes them from there, whatever ended the first one.
     find_neighbors : bool, optional
         Whether stars that are missing from a given list are found and fitted
         together with those on it. They are not reported. Otherwise the list
@@ -202,7 +206,7 @@ class CrowdedMixturePhotometry:
                  count_slope=1.5, background_size=64, psf_error=0.01,
                  effective_gain=None, maxiters=3, tile_shape=None,
                  overlap=128, executor=None, progress_bar=False,
-                 find_neighbors=True, xy_bounds=1.0):
+                 find_neighbors=True, xy_bounds=1.0, checkpoint=None):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
         self.keep = as_real(keep, 'keep', minimum=0)
@@ -228,6 +232,8 @@ class CrowdedMixturePhotometry:
         self.xy_bounds = xy_bounds
         if xy_bounds is not None:
             self.xy_bounds = as_real(xy_bounds, 'xy_bounds', above=0)
+        self.checkpoint = checkpoint
+        self._checkpoint = Checkpoint(checkpoint)
         self.results = None
         self._noise = np.inf
         self._psf = LocalPSF.of(psf_model)
@@ -270,7 +276,7 @@ class CrowdedMixturePhotometry:
                  else self._listed(init_params, image.unit))
         options = self._options(image)
         plan = Plan(image, self._psf, options, self.tile_shape, self.overlap,
-                    given)
+                    given, self._checkpoint)
         outcomes, errors = run(plan, self.executor, self.progress_bar)
         unfinished = [core for core, outcome in zip(plan.cores, outcomes,
                                                     strict=True)

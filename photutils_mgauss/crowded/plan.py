@@ -9,8 +9,9 @@ from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.crowded.table import no_stars, tabulate
 from photutils_mgauss.crowded.tile import CELL, TileJob, TileOptions
 from photutils_mgauss.psf.local import LocalPSF
+from photutils_mgauss.utils.checkpoint import Checkpoint, digest_of
 from photutils_mgauss.utils.image import PixelData
-from photutils_mgauss.utils.parallel import available_cores
+from photutils_mgauss.utils.parallel import Threads, tell
 
 # The smallest and the largest size of tiles if none is given [pix].
 _TILES = (1024, 2048)
@@ -36,6 +37,19 @@ class Outcome:
         return cls(tabulate(tile, job.core), float(chi.sum()),
                    int(model.good.sum()), tile.widths)
 
+    @classmethod
+    def of_arrays(cls, arrays):
+        """Return what `arrays` made arrays of."""
+        widths = arrays.pop('tile_widths')
+        chi2, n_pixels = arrays.pop('tile_sums')
+        return cls(Stars.of_columns(arrays), float(chi2), int(n_pixels),
+                   widths)
+
+    def arrays(self):
+        """Return all there is as a dict of arrays."""
+        return {**vars(self.stars), 'tile_widths': self.widths,
+                'tile_sums': np.array([self.chi2, self.n_pixels], float)}
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -44,7 +58,8 @@ class Plan:
 
     ``tile_shape`` is the largest shape of a tile, None that of a size that
     does not need much memory and leaves work for more than one worker.
-    ``given`` is None, or the stars of a list.
+    ``given`` is None, or the stars of a list. ``checkpoint`` keeps the tiles
+    that are finished.
     """
 
     image: PixelData
@@ -53,6 +68,7 @@ class Plan:
     tile_shape: tuple | None
     overlap: int
     given: Stars | None
+    checkpoint: Checkpoint | None = None
 
     @property
     def cores(self):
@@ -89,8 +105,21 @@ class Plan:
                 core[3] if core[3] < nx else nx + self.overlap)
 
     def work(self, core):
-        """Cut out a tile and solve it."""
-        return Outcome.of(self.job(core))
+        """Cut out a tile and solve it, if that has not been done before."""
+        job = self.job(core)
+        outcome = self.kept(job)
+        return self.keep(job, Outcome.of(job)) if outcome is None else outcome
+
+    def kept(self, job):
+        """Return the outcome of a tile that was finished before, or None."""
+        arrays = self.checkpoint and self.checkpoint.load(digest_of(job))
+        return Outcome.of_arrays(arrays) if arrays else None
+
+    def keep(self, job, outcome):
+        """Return an outcome, and keep it."""
+        if self.checkpoint:
+            self.checkpoint.save(digest_of(job), outcome.arrays())
+        return outcome
 
 
 def _even_parts(size, largest):
@@ -127,16 +156,31 @@ def run(plan, executor, progress_bar):
     errors : list of Exception
     """
     if executor is None:
-        with ThreadPoolExecutor(available_cores()) as pool:
+        with Threads() as pool:
             return run(plan, pool, progress_bar)
-    if isinstance(executor, ThreadPoolExecutor):
+    if isinstance(executor, (Threads, ThreadPoolExecutor)):
         return _collect(executor, plan.work, plan.cores, progress_bar)
-    # Other workers may be elsewhere: they get no more than their tile.
-    return _collect(executor, Outcome.of, map(plan.job, plan.cores),
-                    progress_bar)
+    return _run_elsewhere(plan, executor, progress_bar)
 
 
-def _collect(pool, work, tasks, progress_bar):
+def _run_elsewhere(plan, executor, progress_bar):
+    """Solve tiles where workers get no more than their tile."""
+    if not plan.checkpoint:
+        return _collect(executor, Outcome.of, map(plan.job, plan.cores),
+                        progress_bar)
+    before = [plan.kept(plan.job(core)) for core in plan.cores]
+    left = [core for core, outcome in zip(plan.cores, before, strict=True)
+            if outcome is None]
+    found, errors = _collect(
+        executor, Outcome.of, map(plan.job, left), progress_bar,
+        lambda i, outcome: plan.keep(plan.job(left[i]), outcome))
+    found = iter(found)
+    return [next(found) if outcome is None else outcome
+            for outcome in before], errors
+
+
+def _collect(pool, work, tasks, progress_bar, keep=None):
+    """Have tasks done; ``keep`` is given each number and outcome."""
     outcomes, errors, futures = [], [], {}
     for task in tasks:
         try:
@@ -145,11 +189,16 @@ def _collect(pool, work, tasks, progress_bar):
             errors.append(error)
         outcomes.append(None)
     bar = _bar(len(outcomes)) if progress_bar else None
-    for future in as_completed(futures):
+    for done, future in enumerate(as_completed(futures), 1):
+        number = futures[future]
         try:
-            outcomes[futures[future]] = future.result()
+            outcomes[number] = future.result()
         except Exception as error:  # noqa: BLE001 a worker may die of any
             errors.append(error)
+        else:
+            if keep is not None:
+                keep(number, outcomes[number])
+        tell(done, len(outcomes))
         if bar is not None:
             _advance(bar, outcomes)
     if bar is not None:

@@ -14,7 +14,6 @@ whole problem is
 
 whose size does not depend on the number of stars.
 """
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -22,7 +21,7 @@ import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.rows import kernel_rows_of_logs
-from photutils_mgauss.utils.parallel import available_cores
+from photutils_mgauss.utils.parallel import Threads
 
 # Standard deviations of the prior on log weight, x, y (of the PSF's width),
 # log_p, s, log_q: of a polynomial's constant, and of its other terms. A good
@@ -130,12 +129,12 @@ class Workers:
 
     def __enter__(self):
         if self._own:
-            self.executor = ThreadPoolExecutor(available_cores())
+            self.executor = Threads()
         return self
 
-    def __exit__(self, *args):
+    def __exit__(self, *error):
         if self._own:
-            self.executor.shutdown()
+            self.executor.__exit__(*error)
 
     def map(self, function, n_stars, *args):
         """Call function(*args of a part of the stars) for each part."""

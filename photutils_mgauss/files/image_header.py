@@ -22,6 +22,11 @@ _OLDEST, _NEWEST = -313_000, 455_000
 _COUNTED = {'e': u.electron, 'e-': u.electron, 'electron': u.electron,
             'electrons': u.electron, 'adu': u.adu, 'dn': u.DN,
             'count': u.count, 'counts': u.count}
+# How times are written as numbers, and between which they are (1858 to 2131).
+_NUMBER = re.compile(r'(JD|MJD|J)?\s*=?\s*(\d+\.?\d*(?:E\+?\d+)?)')
+_RANGES = {'jd': (2_400_000.5, 2_500_000), 'mjd': (15_000, 99_999.5),
+           'jyear': (1858, 2200)}
+_PREFIX = {'jd': 'JD', 'mjd': 'MJD', 'jyear': 'J'}
 _RATE = re.compile(r'(.+?)(?:/s(?:ec)?|\*?\*?s(?:\^|\*\*)?-1)')
 
 
@@ -98,15 +103,42 @@ class Cards:
         return str(self.get('TELESCOP') or '').strip().upper()
 
     @property
+    def _scale(self):
+        scale = str(self.get('TIMESYS') or 'utc').strip().lower()
+        return scale if scale in Time.SCALES else 'utc'
+
+    @property
     def time(self):
         """The middle of the exposure, a `~astropy.time.Time`, or None."""
-        scale = str(self.get('TIMESYS') or 'utc').strip().lower()
-        scale = scale if scale in Time.SCALES else 'utc'
         for find in (_middle, _middle_of_limits, _start_and_length):
-            time = _believable(find, self, scale)
+            time = _believable(find, self, self._scale)
             if time is not None:
                 return time
         return None
+
+    def time_at(self, key):
+        """
+        Return the time that a keyword of the user's choice has.
+
+        It may be a date, as 2027-03-14T15:09 or 2027-073T15:09, or a
+        Julian date, a modified one, or a Julian year, also with JD, MJD or J
+        before it.
+
+        Raises
+        ------
+        ValueError
+            If there is no such keyword, or no time in it.
+        """
+        value = self.get(key)
+        if value is None:
+            msg = f'the keyword {key} must have the time, but is not there'
+            raise ValueError(msg)
+        try:
+            return any_time(value, self._scale)
+        except ValueError as error:
+            msg = (f'the keyword {key} must have a date, a Julian date or a '
+                   f'Julian year, got {value!r}')
+            raise ValueError(msg) from error
 
 
 def parse_unit(text):
@@ -152,6 +184,26 @@ def _believable(find, cards, scale):
         return None
     return (time if time is not None and _OLDEST < time.mjd < _NEWEST
             else None)
+
+
+def any_time(value, scale):
+    """Return the time that a number or text can only mean."""
+    text = str(value).strip().upper()
+    number = _NUMBER.fullmatch(text)
+    if number is None:
+        # The day of the year, which astropy reads with colons only.
+        text = re.sub(r'^(\d{4}-\d{3})T', lambda day: day[1].replace(
+            '-', ':') + ':', text)
+        return Time(text, scale=scale)
+    days = float(number[2])
+    kinds = [kind for kind, (low, high) in _RANGES.items()
+             if low < days < high and number[1] in (None, _PREFIX[kind])]
+    if not kinds:
+        raise ValueError(text)
+    kind, = kinds
+    # A Julian year is a rate of time of its own.
+    return Time(days, format=kind,
+                scale='tdb' if kind == 'jyear' else scale)
 
 
 def _middle(cards, scale):

@@ -83,7 +83,8 @@ class Layers:
         return bad
 
 
-def read_layers(path, *, ext=None, beside=None):
+def read_layers(path, *, ext=None, error_ext=None, flags_ext=None,
+                beside=None):
     """
     Read an image and what belongs to it.
 
@@ -93,6 +94,9 @@ def read_layers(path, *, ext=None, beside=None):
         A FITS or ASDF file.
     ext : str, optional
         The extension with the image: a number, a name, or 'name,version'.
+    error_ext, flags_ext : str, optional
+        Those with the errors (weights or variances if their names say so)
+        and with the flags, where their names do not tell. FITS only.
     beside : dict, optional
         Files with 'error', 'weight' (inverse variance) or 'flags'. What
         neither they nor the image's own file hold is looked for in files
@@ -109,25 +113,52 @@ def read_layers(path, *, ext=None, beside=None):
     """
     path = Path(path)
     with undamaged(path, _IMAGE):
+        named = {'error': error_ext, 'flags': flags_ext}
         layers = (_read_asdf(path) if is_asdf(path)
-                  else _read_fits(path, ext))
+                  else _read_fits(path, ext, named))
     given = {kind: Path(file) for kind, file in (beside or {}).items()
              if file}
-    return _with_companions(path, layers, given)
+    return with_all_errors(path, _with_companions(path, layers, given))
 
 
-def _read_fits(path, ext):
+def with_all_errors(path, layers):
+    """
+    Give pixels an error that have none only because they are negative.
+
+    Errors made from the pixels themselves are often 0 where a pixel is below
+    0. Without those pixels, all that is left of the noise is above 0.
+    """
+    if layers.error is None:
+        return layers
+    with np.errstate(invalid='ignore'):
+        lacking = (layers.error == 0) & (layers.data < 0)
+        known = np.isfinite(layers.error) & (layers.error > 0)
+        faint = known & (layers.data <= np.nanmedian(layers.data))
+    if not lacking.any() or not faint.any():
+        return layers
+    error = np.median(layers.error[faint])
+    warnings.warn(
+        f'{path}: {lacking.sum()} of {lacking.size} pixels are negative and '
+        f'have the error 0; they get {error:.4g}, the median error of the '
+        'faint pixels', AstropyUserWarning, stacklevel=3)
+    return replace(layers, error=np.where(lacking, error, layers.error))
+
+
+def _read_fits(path, ext, named):
     with open_fits(path, _IMAGE) as hdus:
         hdu = _science(path, hdus, ext)
         data = _plane(path, hdu)
         sources = {'image': label_of(hdus, hdu)}
-        error = _first(path, hdus, hdu, _NOISE, sources, 'error')
+        error = (_named(path, hdus, named, sources, 'error')
+                 or _first(path, hdus, hdu, _NOISE, sources, 'error'))
         if error is not None:
-            kind = _NOISE[sources['error'].split(',')[0]]
-            error = to_error(error, kind)
-        flags = _first(path, hdus, hdu, _FLAGS, sources, 'flags')
+            kind = _NOISE.get(error.name, 'error')
+            error = to_error(_plane(path, error), kind)
+        flags = (_named(path, hdus, named, sources, 'flags')
+                 or _first(path, hdus, hdu, _FLAGS, sources, 'flags'))
+        flags = None if flags is None else np.array(flags.data)
         weight = _first(path, hdus, hdu, ('WHT',), {}, 'weight')
-        covered = None if weight is None else weight > 0
+        covered = None if weight is None else _plane(path, weight) > 0
         cards = Cards(hdu.header, hdus[0].header)
         wcs, problem = None, None
         try:
@@ -167,11 +198,11 @@ def _is_image(hdu):
     return hdu.is_image and hdu.header.get('NAXIS') == 2
 
 
-def _chosen(path, hdus, images, ext):
+def _chosen(path, hdus, images, ext, option='--ext'):
     hdu = chosen_hdu(hdus, images, ext)
     if hdu is None:
         names = ', '.join(label_of(hdus, image) for image in images)
-        msg = (f'{path}: --ext must name an image of 2 dimensions '
+        msg = (f'{path}: {option} must name an image of 2 dimensions '
                f'({names or "there is none"}), got {ext}')
         raise ValueError(msg)
     return hdu
@@ -191,10 +222,18 @@ def _first(path, hdus, science, names, sources, what):
         if (hdu.name in names and hdu.ver == science.ver
                 and hdu is not science and _is_image(hdu)):
             sources[what] = label_of(hdus, hdu)
-            if what == 'flags':
-                return np.array(hdu.data)
-            return _plane(path, hdu)
+            return hdu
     return None
+
+
+def _named(path, hdus, named, sources, what):
+    """Return the extension that the user names for errors or flags."""
+    if named[what] is None:
+        return None
+    images = [hdu for hdu in hdus if _is_image(hdu)]
+    hdu = _chosen(path, hdus, images, named[what], f'--{what}-ext')
+    sources[what] = label_of(hdus, hdu)
+    return hdu
 
 
 def to_error(values, kind):

@@ -33,12 +33,13 @@ def read_table(path):
         If it is damaged or no table.
     """
     from astropy.table import QTable
-    with undamaged(path, 'a table that astropy can read'):
+    what = 'a table that astropy can read'
+    with undamaged(path, what):
         with Path(path).open('rb') as file:
             start = file.read(6)
         if start.startswith(_FITS_MARKS):
             # Checks the sizes that the headers tell of.
-            with open_fits(path):
+            with open_fits(path, what):
                 table = QTable.read(path)
         else:
             table = QTable.read(path)

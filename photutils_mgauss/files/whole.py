@@ -35,7 +35,8 @@ def whole_file(path, *, overwrite=True):
         # A device or a pipe cannot be replaced.
         yield path
         return
-    draft = path.with_name(f'.{uuid4().hex}.{path.name}')
+    # Not longer than a name may be, but with the suffixes.
+    draft = path.with_name(f'.{uuid4().hex}.{path.name[-80:]}')
     try:
         yield draft
         if path.exists():

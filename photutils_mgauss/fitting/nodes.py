@@ -19,9 +19,11 @@ from scipy.ndimage import map_coordinates, spline_filter
 from tqdm.auto import tqdm
 
 from photutils_mgauss.fitting.image import fit_mixture
+from photutils_mgauss.fitting.kept import fit_or_recall
 from photutils_mgauss.fitting.phases import FLUX_LIMIT, flux_phase_error
 from photutils_mgauss.psf.grid import plain_report
 from photutils_mgauss.psf.shapes import adaptive_moments
+from photutils_mgauss.utils.checkpoint import Checkpoint
 from photutils_mgauss.utils.parallel import available_cores
 from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 
@@ -29,10 +31,12 @@ from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 _PHASES = 4
 # Stars are rarely fitted on more than 11 x 11 pixels.
 _PHASE_RADIUS = 5.5
+# As many nodes are kept together, at least.
+_KEPT = 32
 
 
 def fit_nodes(nodes, n_components, *, radius=None, start='centre',
-              executor=None, progress_bar=False, **kwargs):
+              executor=None, progress_bar=False, checkpoint=None, **kwargs):
     """
     Fit a mixture to every image.
 
@@ -51,6 +55,8 @@ def fit_nodes(nodes, n_components, *, radius=None, start='centre',
         Where to fit.
     progress_bar : bool, optional
         Whether to show one.
+    checkpoint : str or path-like, optional
+        A folder in which finished fits are kept, and looked for.
     **kwargs
         Further keywords of `fit_mixture`.
 
@@ -69,15 +75,17 @@ def fit_nodes(nodes, n_components, *, radius=None, start='centre',
     if 'mask' in kwargs:
         mask = mask | np.asarray(kwargs.pop('mask'), bool)
     options = {'oversampling': nodes.oversampling, 'origin': nodes.centre,
-               'radius': radius, 'executor': executor, **kwargs}
+               'radius': radius, **kwargs}
     images = np.where(mask, 0.0, nodes.images)
     first = _first_fit(images, mask, nodes, n_components, options, start)
-    fits = []
-    for chunk in _chunks(len(images), progress_bar):
-        fits += fit_mixture(images[chunk], n_components, mask=mask[chunk],
-                            start=first, **options)
+    work = {'n_components': n_components, 'start': first, **options}
+    store, fits = Checkpoint(checkpoint), []
+    for chunk in _chunks(len(images), progress_bar, bool(store)):
+        fits += fit_or_recall(store, images[chunk], mask[chunk], work,
+                              executor)
     if first is not None and kwargs.get('weighting') == 'photometric':
-        fits = _refitted(fits, images, mask, nodes, n_components, options)
+        fits = _refitted(fits, images, mask, nodes, n_components,
+                         {**options, 'executor': executor})
     report = _report(nodes, images, mask, fits, radius, executor)
     mixtures = [fit.mixture and fit.mixture.affine(nodes.unit * np.eye(2))
                 if nodes.unit != 1 else fit.mixture for fit in fits]
@@ -93,7 +101,7 @@ def _first_fit(images, mask, nodes, n_components, options, start):
     distance[nodes.blank] = np.inf
     for node in np.argsort(distance)[:3]:
         fit, = fit_mixture(images[[node]], n_components, mask=mask[[node]],
-                           **{**options, 'executor': None})
+                           **options)
         if fit.status.usable:
             return fit.mixture
     return None
@@ -119,9 +127,14 @@ def _refitted(fits, images, mask, nodes, n_components, options):
     return better
 
 
-def _chunks(n, progress_bar):
+def _chunks(n, progress_bar, kept):
     """Yield slices of nodes, under a progress bar if one is wanted."""
-    size = max(32 * available_cores(), -(-n // 40)) if progress_bar else n
+    size = n
+    if kept:
+        # The same on every machine that may go on with the work.
+        size = max(_KEPT, -(-n // 40))
+    elif progress_bar:
+        size = max(32 * available_cores(), -(-n // 40))
     with tqdm(total=n, desc='Fitting nodes', disable=not progress_bar) as bar:
         for i in range(0, n, size):
             yield slice(i, min(i + size, n))

@@ -6,7 +6,6 @@ by Levenberg-Marquardt in compiled code; what photutils adds around that
 (tables, units, flags) is not here.
 """
 import itertools
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,7 +16,7 @@ from tqdm.auto import tqdm
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.base import PSFModel
 from photutils_mgauss.psf.rows import strides
-from photutils_mgauss.utils.parallel import map_parallel
+from photutils_mgauss.utils.parallel import Threads, map_parallel
 
 CONVERGED = (kernels.CONVERGED, kernels.STALLED)
 BAD_ERROR = kernels.BAD_ERROR
@@ -329,9 +328,8 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     chunks = list(stars.chunks())
     watch = partial(tqdm, desc='Fitting stars', total=len(chunks),
                     disable=not progress_bar)
-    pool = (nullcontext(executor) if n_threads is None
-            else ThreadPoolExecutor(n_threads))
+    pool = nullcontext(executor) if n_threads is None else Threads(n_threads)
     with pool as executor, closing(map_parallel(
-            work, chunks, executor=executor,
+            work, chunks, executor=executor, long=True,
             abandon=partial(stop.fill, True))) as fits:
         return Fits.joined(list(watch(fits)))

@@ -106,7 +106,8 @@ class GridConversions:
 
     @classmethod
     def from_gridded_psf(cls, psf, n_components=None, *, radius=None,
-                         executor=None, progress_bar=False, **kwargs):
+                         executor=None, progress_bar=False, checkpoint=None,
+                         **kwargs):
         """
         Fit mixtures to the ePSFs of a photutils grid.
 
@@ -134,6 +135,10 @@ class GridConversions:
             Where the nodes are fitted; by default in a pool of threads.
         progress_bar : bool, optional
             Whether to show a progress bar.
+        checkpoint : str or path-like, optional
+            A folder in which finished fits are kept. A call with the same
+            images and settings takes them from there, whatever ended the
+            first one. Many detectors can share a folder.
         **kwargs
             Further keywords of `fit_mixture`, except that ``start`` is
             ``'centre'`` (the default: from the fit of the middle node) or
@@ -166,7 +171,8 @@ class GridConversions:
         from photutils_mgauss.fitting import grid
         return _of_each(psf, partial(
             grid.fit_gridded_psf, n_components=n_components, radius=radius,
-            executor=executor, progress_bar=progress_bar, **kwargs))
+            executor=executor, progress_bar=progress_bar,
+            checkpoint=checkpoint, **kwargs))
 
     @classmethod
     def from_psfex(cls, path, n_components=None, *, ext=None,

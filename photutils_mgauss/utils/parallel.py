@@ -1,7 +1,20 @@
-"""Spreading independent pieces of work over an executor."""
+"""
+Spreading independent pieces of work over an executor.
+
+What an interrupt (Ctrl-C) has to reach waits here, in a thread that can be
+woken, while compiled loops run in `Threads` that nobody waits for.
+"""
 import os
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar, copy_context
+from functools import partial
 from itertools import chain
+from queue import Empty, SimpleQueue
+from threading import Thread, current_thread, main_thread
+
+# Who wants to know how many pieces are done; see `watched`.
+_WATCHER = ContextVar('watcher', default=None)
 
 
 def available_cores():
@@ -12,7 +25,112 @@ def available_cores():
         return os.cpu_count() or 1
 
 
-def map_parallel(function, *columns, executor=None, abandon=None):
+class Threads(Executor):
+    """
+    A pool of threads for compiled loops.
+
+    The threads of the standard library's pool are waited for when something
+    goes wrong, and again when the program ends: a compiled loop would hold up
+    an interrupt until it is through. Nobody waits for these. They end with
+    the program, and work in the context (`contextvars`) of their caller.
+
+    Parameters
+    ----------
+    n : int, optional
+        The number of threads; by default one for each core.
+    """
+
+    def __init__(self, n=None):
+        self._tasks = SimpleQueue()
+        self._is_open = True
+        self._threads = [Thread(target=self._work, daemon=True)
+                         for _ in range(n or available_cores())]
+        for thread in self._threads:
+            thread.start()
+
+    def submit(self, function, /, *args, **kwargs):
+        """Have a function called by the next free thread."""
+        if not self._is_open:
+            msg = 'cannot submit to a pool of threads that has been shut down'
+            raise RuntimeError(msg)
+        future, context = Future(), copy_context()
+        # Pieces of a piece are not what anybody watches.
+        context.run(_WATCHER.set, None)
+        self._tasks.put((future, partial(context.run, function, *args,
+                                         **kwargs)))
+        return future
+
+    def _work(self):
+        while (task := self._tasks.get()) is not None:
+            _fulfil(*task)
+            del task  # or it would live until the next one comes
+
+    def shutdown(self, wait=True, *, cancel_futures=False):
+        """Take no more work; see `concurrent.futures.Executor.shutdown`."""
+        if cancel_futures:
+            with suppress(Empty):
+                while True:
+                    task = self._tasks.get_nowait()
+                    if task is not None:
+                        task[0].cancel()
+        if self._is_open:
+            self._is_open = False
+            for _ in self._threads:
+                self._tasks.put(None)
+        if wait:
+            for thread in self._threads:
+                thread.join()
+
+    def __exit__(self, kind, error, trace):
+        self.shutdown(wait=kind is None, cancel_futures=kind is not None)
+
+
+def _fulfil(future, call):
+    """Make a future come true, unless it has been cancelled."""
+    if not future.set_running_or_notify_cancel():
+        return
+    try:
+        result = call()
+    except BaseException as error:  # noqa: BLE001 the caller gets it
+        future.set_exception(error)
+    else:
+        future.set_result(result)
+
+
+@contextmanager
+def watched(watcher):
+    """
+    Let somebody know how the work in this context gets on.
+
+    Parameters
+    ----------
+    watcher : callable
+        Called with the number of pieces done and that of all pieces,
+        whenever another one is done, by the thread that waits for them.
+    """
+    token = _WATCHER.set(watcher)
+    try:
+        yield
+    finally:
+        _WATCHER.reset(token)
+
+
+def tell(done, total):
+    """Tell who watches how many pieces of the work are done."""
+    watcher = _WATCHER.get()
+    if watcher is not None:
+        watcher(done, total)
+
+
+def _told(results, total):
+    """Yield results and tell who watches about each."""
+    for done, result in enumerate(results, 1):
+        tell(done, total)
+        yield result
+
+
+def map_parallel(function, *columns, executor=None, long=False,
+                 abandon=None):
     """
     Call a function on pieces of work and yield what it returns, in order.
 
@@ -25,32 +143,37 @@ def map_parallel(function, *columns, executor=None, abandon=None):
     executor : `~concurrent.futures.Executor`, optional
         Where to run; None is a pool of threads on all cores, or this thread
         where one core or one piece is all there is. An exception, or closing
-        the generator, cancels the pieces that have not begun.
+        the generator, cancels the pieces that have not begun, and does not
+        wait for those that have.
+    long : bool, optional
+        Whether a single piece may take seconds. It gets a thread, too: the
+        main thread cannot be interrupted inside a compiled loop.
     abandon : callable, optional
-        Called without arguments when that happens, before those that have
-        begun are waited for. All pieces run in threads then: this one has to
-        see the interrupt.
+        Called without arguments when the results are given up, so that pieces
+        that have begun can end early.
     """
-    if executor is not None:
-        yield from _map_until(executor, function, columns, abandon)
-        return
-    columns = [list(column) for column in columns]
-    cores = available_cores()
-    if abandon is None and (cores == 1 or len(columns[0]) < 2):
-        yield from map(function, *columns)
-        return
-    with ThreadPoolExecutor(cores) as pool:
-        yield from _map_until(pool, function, columns, abandon)
-
-
-def _map_until(pool, function, columns, abandon):
-    """Map over an executor; tell if the results are given up."""
     try:
-        yield from pool.map(function, *columns)
+        yield from _results(function, columns, executor, long)
     except BaseException:
         if abandon is not None:
             abandon()
         raise
+
+
+def _results(function, columns, executor, long):
+    """Yield the results; see `map_parallel`."""
+    columns = [list(column) for column in columns]
+    n = len(columns[0])
+    if executor is not None:
+        yield from _told(executor.map(function, *columns), n)
+        return
+    n_threads = min(available_cores(), n)
+    waits = long and n > 0 and current_thread() is main_thread()
+    if n_threads < 2 and not waits:
+        yield from _told(map(function, *columns), n)
+        return
+    with Threads(n_threads) as pool:
+        yield from _told(pool.map(function, *columns), n)
 
 
 def map_chunks(function, arrays, executor, *, chunk_size=None, most=None):

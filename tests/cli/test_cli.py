@@ -68,7 +68,7 @@ def test_the_demonstration_writes_what_it_made(demo):
     assert (folder / 'motions.png').exists()
     assert (folder / 'positions.png').exists()
     assert '12 files in' in run.stdout
-    assert 'simulate' in run.stderr  # the progress bar
+    assert run.stderr == ''  # no bar where nobody looks at it
 
 
 def test_the_demonstration_recovers_the_true_motions(demo):
@@ -340,7 +340,7 @@ def test_without_wcs_there_are_no_places_on_the_sky(chain, without_wcs,
     assert run.returncode == 1
     assert 'bare_cat.ecsv: must have a WCS or columns ra and dec' in (
         run.stderr)
-    assert not list((chain / 'none').iterdir())
+    assert not (chain / 'none').exists()
 
 
 def test_without_time_it_has_to_be_given(chain, without_wcs, capsys):

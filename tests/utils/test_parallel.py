@@ -1,12 +1,20 @@
 """Work spread over threads, or whatever executor is given."""
+import os
+import signal
+import time
 from concurrent.futures import ThreadPoolExecutor
-from threading import Barrier, Event
+from threading import Barrier, Event, Timer
 
 import numpy as np
 import pytest
 
 from photutils_mgauss.utils import parallel
-from photutils_mgauss.utils.parallel import map_chunks, map_parallel
+from photutils_mgauss.utils.parallel import (
+    Threads,
+    map_chunks,
+    map_parallel,
+    watched,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -73,3 +81,44 @@ def test_slices_are_no_longer_than_the_longest_allowed():
                          None, most=7)
     assert max(lengths) == 7
     assert len(lengths) == 1000
+
+
+@pytest.mark.parametrize('n', [1, 3])
+def test_an_interrupt_waits_for_no_piece(n, monkeypatch):
+    monkeypatch.setattr(parallel, 'available_cores', lambda: 2)
+    end = Event()
+    Timer(0.3, os.kill, [os.getpid(), signal.SIGINT]).start()
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        list(map_parallel(lambda _: end.wait(30), range(n), long=True))
+    assert time.monotonic() - start < 5
+    end.set()
+
+
+def test_pieces_work_in_the_context_of_the_caller(four_cores):
+    with np.errstate(divide='raise'), pytest.raises(FloatingPointError):
+        list(map_parallel(lambda one: np.ones(1) / one, np.zeros((3, 1))))
+
+
+def test_a_pool_of_threads_that_is_shut_down_cancels_what_has_not_begun():
+    begun, hold = Event(), Event()
+    pool = Threads(1)
+    first = pool.submit(lambda: begun.set() or hold.wait(30))
+    second = pool.submit(print)
+    begun.wait(10)
+    pool.shutdown(wait=False, cancel_futures=True)
+    hold.set()
+    assert first.result(10) is True
+    assert second.cancelled()
+    with pytest.raises(RuntimeError, match='shut down'):
+        pool.submit(print)
+
+
+def test_who_watches_is_told_of_each_piece(executor):
+    told = []
+    with watched(lambda *numbers: told.append(numbers)):
+        list(map_parallel(lambda n: list(map_parallel(abs, range(n))),
+                          range(3), executor=executor))
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    list(map_parallel(abs, range(3), executor=executor))
+    assert len(told) == 3
