@@ -12,7 +12,7 @@ def available_cores():
         return os.cpu_count() or 1
 
 
-def map_parallel(function, *columns, executor=None, abandon=None):
+def map_parallel(function, *columns, executor=None):
     """
     Call a function on pieces of work and yield what it returns, in order.
 
@@ -26,31 +26,17 @@ def map_parallel(function, *columns, executor=None, abandon=None):
         Where to run; None is a pool of threads on all cores, or this thread
         where one core or one piece is all there is. An exception, or closing
         the generator, cancels the pieces that have not begun.
-    abandon : callable, optional
-        Called without arguments when that happens, before those that have
-        begun are waited for. All pieces run in threads then: this one has to
-        see the interrupt.
     """
     if executor is not None:
-        yield from _map_until(executor, function, columns, abandon)
+        yield from executor.map(function, *columns)
         return
     columns = [list(column) for column in columns]
     cores = available_cores()
-    if abandon is None and (cores == 1 or len(columns[0]) < 2):
+    if cores == 1 or len(columns[0]) < 2:
         yield from map(function, *columns)
         return
     with ThreadPoolExecutor(cores) as pool:
-        yield from _map_until(pool, function, columns, abandon)
-
-
-def _map_until(pool, function, columns, abandon):
-    """Map over an executor; tell if the results are given up."""
-    try:
         yield from pool.map(function, *columns)
-    except BaseException:
-        if abandon is not None:
-            abandon()
-        raise
 
 
 def map_chunks(function, arrays, executor, *, chunk_size=None, most=None):
