@@ -55,6 +55,7 @@ _OWNERS = {
     'pixel_error': 'photometry',
     'pixel_phase_error': 'photometry',
     'PixelPhaseError': 'photometry',
+    'to_flux_densities': 'photometry',
     'CrowdedMixturePhotometry': 'crowded',
     'inject_and_recover': 'crowded',
     'InjectionResult': 'crowded',

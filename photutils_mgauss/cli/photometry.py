@@ -54,6 +54,9 @@ def add_measuring(parser):
     group.add_argument('--fit-shape', type=tools.count, default=11,
                        metavar='PIXELS', help='side of the fitted region, '
                        'odd (default: %(default)s)')
+    group.add_argument('--magnitudes', action='store_true',
+                       help='add AB magnitudes; for images in MJy/sr or a '
+                            'unit of flux density')
 
 
 def run(options):
@@ -110,7 +113,9 @@ def measure(image, psf, options):
             msg = 'must show a star, got none; try --threshold'
             raise ValueError(msg)
         _check_fits(image, table)
-        return _with_sky(_with_unit(table, image.unit), image)
+        table = _with_flux_density(_with_unit(table, image.unit), image,
+                                   options)
+        return _with_sky(table, image)
 
 
 def _check_fits(image, table):
@@ -168,6 +173,22 @@ def _with_unit(table, unit):
             if name in table.colnames:
                 table[name] = table[name] * unit
     return table
+
+
+def _with_flux_density(table, image, options):
+    """Return the table with fluxes in Jy, where the image knows of it."""
+    from photutils_mgauss.files.image_header import is_surface_brightness
+    from photutils_mgauss.photometry.many_images import to_flux_densities
+    area, bright = (image.layers.cards.pixel_area,
+                    is_surface_brightness(image.unit))
+    known = area is not None or image.wcs is not None
+    if bright and not known:
+        tools.say(options, f'{image.path}: fluxes are in {image.unit} times '
+                           'a pixel, as there is neither PIXAR_SR nor a WCS')
+    if not options.magnitudes and not (bright and known):
+        return table
+    return to_flux_densities(table, pixel_area=area, wcs=image.wcs,
+                             magnitudes=options.magnitudes)
 
 
 def _with_sky(table, image):

@@ -12,7 +12,10 @@ import numpy as np
 from photutils.background import Background2D
 from photutils.utils import calc_total_error
 
-from photutils_mgauss.files.image_header import electrons_in_unit
+from photutils_mgauss.files.image_header import (
+    electrons_in_unit,
+    is_surface_brightness,
+)
 from photutils_mgauss.files.image_layers import read_layers, read_wcs
 from photutils_mgauss.photometry.noise import background_error, pixel_error
 from photutils_mgauss.sky.observers import julian_years
@@ -154,8 +157,12 @@ class StarImage:
     @property
     def electrons(self):
         """The electrons in a unit of the image, or None."""
+        # A gain of the user's is in the unit of an image that has no counts.
+        conversion = (None if self.reading.gain is not None
+                      else self.layers.cards.conversion)
         known = electrons_in_unit(self.unit, self._or_header('gain'),
-                                  self._or_header('exposure_time'))
+                                  self._or_header('exposure_time'),
+                                  conversion)
         return self.reading.gain if known is None else known
 
     @cached_property
@@ -181,10 +188,15 @@ class StarImage:
 
     def _no_noise(self):
         unit = 'no unit' if self.unit is None else f'the unit {self.unit}'
+        header = (
+            '; or the keywords GAIN [electron/DN], EXPTIME [s] and PHOTMJSR '
+            'or FLUXCONV [MJy/sr per DN/s], whose GAIN * EXPTIME / PHOTMJSR '
+            'is that number of electrons'
+            if is_surface_brightness(self.unit) else '')
         return (f'{self.path}: the noise must be known; it has neither an '
                 f'extension ERR nor a file beside it, and for an image with '
                 f'{unit} it takes --gain (electrons in a count or unit) and, '
-                f'for rates, --exposure-time')
+                f'for rates, --exposure-time{header}')
 
     def check(self):
         """Raise if the image lacks what it takes to measure it."""

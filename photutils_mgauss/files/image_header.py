@@ -9,6 +9,8 @@ from astropy.time import Time
 _GAIN = ('GAIN', 'EGAIN', 'ATODGAIN', 'CCDGAIN')
 _READ_NOISE = ('RDNOISE', 'READNOIS', 'RON', 'READNSEA')
 _EXPOSURE_TIME = ('EXPTIME', 'XPOSURE', 'EFFEXPTM', 'TEXPTIME', 'EXPOSURE')
+# MJy/sr for one DN/s.
+_CONVERSION = ('PHOTMJSR', 'FLUXCONV')
 _SATURATION = ('SATURATE', 'SATLEVEL', 'SATURAT')
 
 # Numbers in headers are smaller, which leaves out infinity.
@@ -70,6 +72,7 @@ class Cards:
     gain = _positive(_GAIN, 'Electrons in a count.')
     read_noise = _positive(_READ_NOISE, 'The noise of the readout [electron].')
     exposure_time = _positive(_EXPOSURE_TIME, 'The exposure time [s].')
+    conversion = _positive(_CONVERSION, 'MJy/sr for a count each second.')
     saturation = _positive(
         _SATURATION, 'The level from which pixels are saturated, in the '
         "image's unit.")
@@ -84,6 +87,12 @@ class Cards:
         """The unit of the image, or None."""
         text = self.get('BUNIT')
         return None if text is None else parse_unit(str(text))
+
+    @property
+    def pixel_area(self):
+        """The area of a pixel, a `~astropy.units.Quantity`, or None."""
+        area = self.positive('PIXAR_SR')
+        return None if area is None else area * u.sr
 
     @property
     def removed_sky(self):
@@ -152,7 +161,12 @@ def parse_unit(text):
     return None if isinstance(unit, u.UnrecognizedUnit) else unit
 
 
-def electrons_in_unit(unit, gain, exposure_time):
+def is_surface_brightness(unit):
+    """Return whether a unit is that of MJy/sr."""
+    return unit is not None and unit.is_equivalent(u.MJy / u.sr)
+
+
+def electrons_in_unit(unit, gain, exposure_time, conversion=None):
     """
     Return the electrons in one unit of an image, None if that is unknown.
 
@@ -164,8 +178,14 @@ def electrons_in_unit(unit, gain, exposure_time):
         Electrons in a count.
     exposure_time : float or None
         In seconds.
+    conversion : float, optional
+        MJy/sr for a count each second, for an image of surface brightness.
     """
     unit = u.adu if unit is None else unit
+    if is_surface_brightness(unit):
+        known = gain and exposure_time and conversion
+        return known and (gain * exposure_time / conversion
+                          * unit.to(u.MJy / u.sr))
     for counted in set(_COUNTED.values()):
         each = 1.0 if counted is u.electron else gain
         if unit == counted:

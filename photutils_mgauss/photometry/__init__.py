@@ -17,6 +17,7 @@ __getattr__, __dir__, __all__ = hand_on(__name__, {
     'decode_psf_flags': 'flags',
     'add_sky_positions': 'many_images',
     'fit_many': 'many_images',
+    'to_flux_densities': 'many_images',
     'cramer_rao': 'noise',
     'background_error': 'noise',
     'CramerRao': 'noise',

@@ -6,7 +6,7 @@ by Levenberg-Marquardt in compiled code; what photutils adds around that
 (tables, units, flags) is not here.
 """
 import itertools
-from contextlib import closing, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -322,14 +322,28 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     -------
     Fits
     """
-    # Where the call is interrupted, a large group would go on for long.
     stop = np.zeros(1, bool)
     work = partial(_fit_chunk, image, psf, fit_sky, max_iterations, stop)
     chunks = list(stars.chunks())
     watch = partial(tqdm, desc='Fitting stars', total=len(chunks),
                     disable=not progress_bar)
-    pool = nullcontext(executor) if n_threads is None else Threads(n_threads)
-    with pool as executor, closing(map_parallel(
-            work, chunks, executor=executor, long=True,
-            abandon=partial(stop.fill, True))) as fits:
+    pool = (nullcontext(executor) if n_threads is None
+            or executor is not None else Threads(n_threads))
+    with pool as executor, _interruptible(stop), closing(map_parallel(
+            work, chunks, executor=executor, long=True)) as fits:
         return Fits.joined(list(watch(fits)))
+
+
+@contextmanager
+def _interruptible(stop):
+    """
+    Tell the kernels to end if nobody waits for them any more.
+
+    They run in other threads even where there is one chunk only: this one
+    has to see the interrupt.
+    """
+    try:
+        yield
+    except BaseException:
+        stop.fill(True)
+        raise

@@ -1,5 +1,5 @@
 r"""
-Stars measured on the sky: positions of a table, and of several images at once.
+Stars measured on the sky: a table's positions and fluxes, and several images.
 
 Where n images show the same star, its one position on the sky and its flux in
 each image are fitted to all their pixels together. With the Jacobian
@@ -37,9 +37,12 @@ from photutils_mgauss.utils.image import read_pixels
 from photutils_mgauss.utils.star_columns import column_values
 from photutils_mgauss.utils.validation import as_shape
 
-__all__ = ['add_sky_positions', 'fit_many']
+__all__ = ['add_sky_positions', 'fit_many', 'to_flux_densities']
 
 _MAX_STEPS = 100
+
+# The flux density of AB magnitude 0 [Jy].
+_AB_ZERO = u.ABflux.to(u.Jy)
 
 # Of the next step [pix], as for single images.
 _TOLERANCE = 1e-6
@@ -101,6 +104,106 @@ def add_sky_positions(table, wcs):
     jacobian = np.moveaxis(pixel_jacobian(wcs, plane, x, y), -1, 0)
     _add_columns(out, vectors, plane, _turn(covariance, jacobian))
     return out
+
+
+def to_flux_densities(table, *, pixel_area=None, wcs=None, magnitudes=False):
+    r"""
+    Return a table of photometry with its fluxes in Jy.
+
+    A flux in an image of surface brightness is a sum over pixels, in MJy/sr;
+    times the area of a pixel on the sky it is a flux density. AB magnitudes
+    are :math:`-2.5 \log_{10}(f_\nu / 3631\,\mathrm{Jy})`.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        With ``flux_fit`` and ``flux_err`` and, if at hand, ``flux_init``, in
+        MJy/sr or a unit like it, or flux densities already.
+    pixel_area : `~astropy.units.Quantity`, optional
+        The area of a pixel, as in the keyword ``PIXAR_SR`` [sr].
+    wcs : APE 14 WCS, optional
+        Where there is no ``pixel_area``, that at each star is taken from
+        this gwcs or `astropy.wcs.WCS`.
+    magnitudes : bool, optional
+        Whether to add the columns ``mag_ab`` and ``mag_ab_err`` [mag], NaN
+        where the flux is not positive.
+
+    Returns
+    -------
+    `~astropy.table.QTable`
+        A copy. Backgrounds stay as they are.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing, or fluxes are of another kind, or of surface
+        brightness while the area of a pixel is not known.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from photutils_mgauss import to_flux_densities
+    >>> stars = QTable({'flux_fit': [40.0] * u.MJy / u.sr,
+    ...                 'flux_err': [0.4] * u.MJy / u.sr})
+    >>> stars = to_flux_densities(stars, pixel_area=9.1e-14 * u.sr,
+    ...                           magnitudes=True)
+    >>> stars['flux_fit']
+    <Quantity [3.64e-06] Jy>
+    >>> stars['mag_ab'].round(3), stars['mag_ab_err'].round(3)
+    (<Quantity [22.497] mag>, <Quantity [0.011] mag>)
+    """
+    missing = {'flux_fit', 'flux_err'} - set(table.colnames)
+    if missing:
+        msg = f'table must have the column {min(missing)}, got none'
+        raise ValueError(msg)
+    out = table.copy()
+    unit = getattr(table['flux_fit'], 'unit', None) or u.one
+    if unit.is_equivalent(u.Jy):
+        area = 1.0
+    elif unit.is_equivalent(u.Jy / u.sr):
+        area = _pixel_areas(table, pixel_area, wcs)
+    else:
+        msg = ('table must have flux_fit in a unit like MJy/sr or Jy, got '
+               f'{unit.to_string() or "no unit"}')
+        raise ValueError(msg)
+    for name in {'flux_init', 'flux_fit', 'flux_err'} & set(out.colnames):
+        out[name] = (u.Quantity(out[name]) * area).to(u.Jy)
+    if magnitudes:
+        _add_magnitudes(out)
+    return out
+
+
+def _pixel_areas(table, pixel_area, wcs):
+    """Return the area of a pixel, of one for all or at each star."""
+    if pixel_area is not None:
+        try:
+            area = u.Quantity(pixel_area, u.sr)
+        except (TypeError, u.UnitConversionError) as reason:
+            msg = ('pixel_area must be a solid angle, as 9.1e-14 * u.sr, got '
+                   f'{pixel_area!r:.80}')
+            raise ValueError(msg) from reason
+        if not (area > 0).all():
+            msg = f'pixel_area must be positive, got {pixel_area}'
+            raise ValueError(msg)
+        return area
+    if wcs is None:
+        msg = ('fluxes of surface brightness need pixel_area (the keyword '
+               'PIXAR_SR) or wcs, got neither')
+        raise ValueError(msg)
+    check_celestial(wcs)
+    x, y = (column_values(table, name, u.pix) for name in ('x_fit', 'y_fit'))
+    plane = TangentPlane.around(pixel_to_vectors(wcs, x, y))
+    jacobian = np.moveaxis(pixel_jacobian(wcs, plane, x, y), -1, 0)
+    return np.abs(np.linalg.det(jacobian)) * u.mas**2
+
+
+def _add_magnitudes(table):
+    flux, error = (np.asarray(table[name].to_value(u.Jy), float)
+                   for name in ('flux_fit', 'flux_err'))
+    flux = np.where(flux > 0, flux, np.nan)
+    table['mag_ab'] = -2.5 * np.log10(flux / _AB_ZERO) * u.mag
+    table['mag_ab_err'] = 2.5 / np.log(10) * error / flux * u.mag
 
 
 def _turn(covariance, jacobian):

@@ -129,8 +129,7 @@ def _told(results, total):
         yield result
 
 
-def map_parallel(function, *columns, executor=None, long=False,
-                 abandon=None):
+def map_parallel(function, *columns, executor=None, long=False):
     """
     Call a function on pieces of work and yield what it returns, in order.
 
@@ -148,20 +147,7 @@ def map_parallel(function, *columns, executor=None, long=False,
     long : bool, optional
         Whether a single piece may take seconds. It gets a thread, too: the
         main thread cannot be interrupted inside a compiled loop.
-    abandon : callable, optional
-        Called without arguments when the results are given up, so that pieces
-        that have begun can end early.
     """
-    try:
-        yield from _results(function, columns, executor, long)
-    except BaseException:
-        if abandon is not None:
-            abandon()
-        raise
-
-
-def _results(function, columns, executor, long):
-    """Yield the results; see `map_parallel`."""
     columns = [list(column) for column in columns]
     n = len(columns[0])
     if executor is not None:

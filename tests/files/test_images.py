@@ -287,6 +287,9 @@ def test_electrons_in_a_unit_follow_from_gain_and_time():
     assert electrons_in_unit(u.DN / u.s, 2, None) is None
     assert electrons_in_unit(None, 2, None) == 2
     assert electrons_in_unit(u.MJy / u.sr, 2, 100) is None
+    assert electrons_in_unit(u.MJy / u.sr, 2, None, 0.5) is None
+    assert electrons_in_unit(u.MJy / u.sr, 2, 100, 0.5) == 400
+    assert_allclose(electrons_in_unit(u.Jy / u.sr, 2, 100, 0.5), 4e-4)
 
 
 def test_the_sky_of_drizzled_images_is_in_the_noise(tmp_path, rng):

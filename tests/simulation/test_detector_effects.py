@@ -3,6 +3,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import label
 
@@ -12,8 +13,10 @@ from photutils_mgauss.simulation import (
     Exposure,
     Instrument,
     crowded_field,
+    csst_psf,
     simulate,
 )
+from photutils_mgauss.simulation.brighter_fatter import _converted
 from photutils_mgauss.simulation.effects import bleed, pattern
 
 
@@ -135,6 +138,39 @@ def test_charge_diffusion_widens_the_true_psf():
             - plain.psf.mixture_at(9, 9).moments().covariance)
     assert_allclose(gain, 0.25 * np.eye(2), atol=1e-12)
     assert wide.image.max() < plain.image.max()
+
+
+def stars_on_uneven_pixels(prnu, strength):
+    return simulate(
+        QTable({'x': np.arange(20.0, 120, 20), 'y': np.full(5, 30.0),
+                'flux': np.full(5, 3e5)}),
+        psf=csst_psf((64, 128)), instrument=Instrument(shape=(64, 128)),
+        exposure=Exposure(), rng=1, effects=DetectorEffects(
+            prnu=prnu, brighter_fatter=strength))
+
+
+@pytest.mark.parametrize('strength', [0.0, 1e-6, 1.0])
+def test_the_pattern_of_the_response_is_gone_from_bright_stars(strength):
+    if strength:
+        pytest.importorskip('galsim')
+    uneven, even = (stars_on_uneven_pixels(prnu, strength).image
+                    for prnu in (0.2, 0.0))
+    bright = even > 5000
+    ratio = uneven[bright] / even[bright]
+    # Photon noise is 1.4 % and charge that moved 1 %; the pattern is 20 %.
+    assert ratio.std() < 0.03
+    assert_allclose(ratio.mean(), 1, atol=0.005)
+
+
+def test_photons_are_turned_into_charge_by_the_pixel_they_fall_on(rng):
+    response = np.full((49, 49), 0.5)
+    response[24, 25] = 1.5
+    places = rng.uniform(-2.5, 2.5, (2, 200_000))
+    kept = np.rint(_converted(places, response, rng)).astype(int)
+    counts = np.zeros((5, 5))
+    np.add.at(counts, (kept[1] + 2, kept[0] + 2), 1)
+    expected = 8000 * response[22:27, 22:27] / 1.5
+    assert (np.abs(counts - expected) < 5 * np.sqrt(expected)).all()
 
 
 def test_all_effects_together_do_not_depend_on_threads():

@@ -1,4 +1,5 @@
 """All calls that take pixels accept the same forms and refuse the same."""
+import warnings
 from types import SimpleNamespace
 
 import astropy.units as u
@@ -152,7 +153,9 @@ def call_photometry(data, **kwargs):
 def call_photutils_engine(data, **kwargs):
     phot = MixturePSFPhotometry(CircularGaussianPRF(fwhm=3), 9,
                                 aperture_radius=4)
-    table = phot(data, init_params=PLACES, **kwargs)
+    with warnings.catch_warnings():
+        warnings.filterwarnings('ignore', message='Photutils fits the')
+        table = phot(data, init_params=PLACES, **kwargs)
     return table_numbers(table, 'x_fit', 'x_err', 'n_pixels_fit', 'flux_fit')
 
 
