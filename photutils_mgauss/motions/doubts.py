@@ -100,8 +100,7 @@ def _floor_ratio(fit, e):
 def _misfit(fit):
     """Compare the chi-square of what ties the frames with the expected."""
     ties = _ties(fit)
-    known = 2 * fit.state.used.sum(axis=0) + fit.ranks
-    dof = np.sum((known - fit.problem.n_parameters)[ties])
+    dof = np.sum(fit.dof[ties])
     chi2 = np.nansum(fit.chi2[ties])
     if dof > 0 and chi2 > FAR**2 * dof:
         yield (f'The {_what(fit)} scatter {np.sqrt(chi2 / dof):.0f} times '

@@ -16,7 +16,7 @@ from photutils_mgauss.motions.perspective import swerved
 from photutils_mgauss.motions.prepare import Setup, State
 from photutils_mgauss.motions.problem import MotionProblem
 from photutils_mgauss.motions.relative import remove_mean_fields
-from photutils_mgauss.motions.stacked import invert_2x2
+from photutils_mgauss.motions.stacked import dimensions_2x2, invert_2x2
 
 CONVERGED = 1e-3  # of the median error of a detection
 MAX_ITERATIONS = 40
@@ -54,6 +54,13 @@ class Fit:
     chi2: np.ndarray
     ranks: np.ndarray
     leak: tuple | None
+
+    @property
+    def dof(self):
+        """Measured and known numbers of each star less parameters, (n,)."""
+        each = dimensions_2x2(self.setup.sightings.covariance)
+        return ((each * self.state.used).sum(axis=0) + self.ranks
+                - self.problem.n_parameters)
 
 
 def finished(setup, state, problem, frames, estimates):

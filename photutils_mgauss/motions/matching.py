@@ -231,7 +231,33 @@ def _pair(master, tree, known, places, sigma, year, tolerance, slack):
     stars[rows[winner]] = claimed
     master.ambiguous[claimed[counts > 1]] = True
     master.ambiguous[first[doubt]] = True
+    rows = np.flatnonzero(stars < 0)
+    taken = np.zeros(len(master.year), dtype=bool)
+    taken[claimed] = True
+    free = known[~taken[known]]
+    if len(rows) and len(free):
+        stars[rows] = _pair_left(master, free, places[:, rows], sigma[rows],
+                                 year, tolerance, slack)
+        master.ambiguous[stars[rows][stars[rows] >= 0]] = True
     return stars
+
+
+def _pair_left(master, free, places, sigma, year, tolerance, slack):
+    """
+    Return for rows that are left the star that is left for them, or -1.
+
+    A fast star is not the one nearest to where it was; but it is paired only
+    where no other row and no other star is within the tolerance.
+    """
+    bound = tolerance.between(master, free, sigma.max(), year, slack).max()
+    tree = cKDTree(master.at(year)[:, free].T)
+    distance, near = tree.query(places.T, k=2, distance_upper_bound=bound)
+    star = np.append(free, -1)[near]
+    inside = [(star[:, k] >= 0) & (distance[:, k] <= tolerance.between(
+        master, star[:, k], sigma, year, slack)) for k in range(2)]
+    found = np.where(inside[0] & ~inside[1], star[:, 0], -1)
+    wanted, counts = np.unique(star[:, 0][inside[0]], return_counts=True)
+    return np.where(np.isin(found, wanted[counts == 1]), found, -1)
 
 
 def _tie(tree, places, tolerance):

@@ -9,6 +9,8 @@ from dataclasses import fields
 
 import numpy as np
 
+THIN = 1000.0  # times another error: nothing was measured in that direction
+
 
 def inverse_factor(matrices, *, tolerance=1e-10):
     r"""
@@ -104,6 +106,14 @@ def is_definite_2x2(covariance):
     xx, xy, yy = covariance
     with np.errstate(invalid='ignore'):
         return (xx > 0) & (yy > 0) & (xx * yy - xy * xy > 1e-12 * xx * yy)
+
+
+def dimensions_2x2(covariance):
+    """Return 1 for covariances (3, ...) of a single direction, else 2."""
+    xx, xy, yy = covariance
+    with np.errstate(invalid='ignore'):
+        thin = (xx + yy)**2 > THIN**2 * (xx * yy - xy * xy)
+    return np.where(thin, 1, 2)
 
 
 class Summed:

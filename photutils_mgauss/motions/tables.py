@@ -191,7 +191,7 @@ def _flags(fit):
 def _add_quality(table, fit, solved):
     sightings, state = fit.setup.sightings, fit.state
     used = state.used.sum(axis=0)
-    dof = (2 * used + fit.ranks - fit.problem.n_parameters).astype(float)
+    dof = fit.dof.astype(float)
     tested = solved & (dof > 0)
     table['n_obs'] = sightings.matches.seen.sum(axis=0)
     table['n_good_obs'] = used

@@ -115,3 +115,36 @@ def test_take_puts_rows_where_their_stars_are():
     matches, _ = match_ids([np.array([5, 7]), np.array([7])])
     values = matches.take([np.array([1.0, 2.0]), np.array([3.0])])
     assert_array_equal(values, [[1.0, 2.0], [np.nan, 3.0]])
+
+
+def fast_star(rng, n=150, baseline=60.0, motion=1000.0):
+    """Return places at two times; the first star passes its neighbours."""
+    first = rng.uniform(-180e3, 180e3, (2, n))
+    first[:, 0] = -30e3, -30e3
+    first[:, 1] = first[:, 0] + [0.4 * motion * baseline, 2e3]
+    second = first + rng.normal(0, 6, (2, n)) * baseline
+    second[:, 0] = first[:, 0] + [motion * baseline, 0]
+    return first, second, (1951.0, 1951.0 + baseline)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_fast_star_is_what_is_left_over(seed):
+    first, second, years = fast_star(np.random.default_rng(seed))
+    n = first.shape[1]
+    sigma = np.full(n, 50.0)
+    matches = match_positions([first, second], [sigma, sigma], years,
+                              Tolerance(None, 1500.0, 2000.0))
+    assert matches.rows.shape[1] == n
+    assert (matches.rows[0] == matches.rows[1]).all()
+    assert matches.ambiguous[0]
+
+
+def test_two_that_are_left_over_are_not_guessed(rng):
+    first, second, years = fast_star(rng)
+    sigma = np.full(first.shape[1], 50.0)
+    more = np.column_stack([first, first[:, 0] + [0, 9e3]])
+    matches = match_positions([more, second],
+                              [np.append(sigma, 50.0), sigma], years,
+                              Tolerance(None, 1500.0, 2000.0))
+    together = (matches.rows >= 0).all(axis=0)
+    assert not together[matches.rows[1] == 0].any()

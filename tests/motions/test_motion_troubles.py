@@ -332,3 +332,31 @@ def test_many_wild_detections_of_one_star_are_rejected(rng, wild):
     assert 300 - wild <= star['n_good_obs'] <= 300 - 0.9 * wild
     assert abs(star['pmra'].value - 3) < 5 * star['pmra_error'].value
     assert star['uwe'] < 1.2
+
+
+def test_a_scan_along_one_direction_is_one_measurement(rng):
+    n, along, across = 40, 0.5, 5000.0
+    years = 1990 + np.sort(rng.uniform(0, 3, n))
+    sin, cos = (one(np.linspace(0, 7, n)) for one in (np.sin, np.cos))
+    offset = np.array([30.0, -55.0])[:, None] * (years - 1991.5)
+    scan = offset[0] * sin + offset[1] * cos + rng.normal(0, along, n)
+    rows = np.column_stack([sin, cos, sin * (years - 1991.5),
+                            cos * (years - 1991.5)])
+    answer, chi2 = np.linalg.lstsq(rows, scan, rcond=None)[:2]
+    epochs = []
+    for year, value, s, c in zip(years, scan, sin, cos, strict=True):
+        covariance = (along**2 * np.outer([s, c], [s, c])
+                      + across**2 * np.outer([c, -s], [c, -s]))
+        errors = np.sqrt(np.diag(covariance))
+        epochs.append(Epoch(Table({
+            'id': [1], 'ra': [84 + value * s / 3.6e6 / np.cos(np.radians(12))],
+            'dec': [-12 + value * c / 3.6e6], 'ra_error': [errors[0]],
+            'dec_error': [errors[1]], 'xy_cov': [covariance[0, 1]]}),
+            time=year))
+    star = ProperMotionFitter(transform=None, clip=None, match_by='id').fit(
+        epochs).stars[0]
+    assert_allclose([star['pmra'].value, star['pmdec'].value], answer[2:],
+                    atol=0.02)
+    assert star['dof'] == n - 4
+    assert_allclose(star['uwe'], np.sqrt(chi2[0] / along**2 / (n - 4)),
+                    rtol=0.01)
