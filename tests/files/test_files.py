@@ -157,6 +157,14 @@ def test_files_of_others_are_refused(tmp_path):
             GriddedMixturePSF.read(tmp_path / name)
 
 
+def test_images_with_extensions_are_refused_in_words(tmp_path):
+    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.ones((2, 2)), name='SCI')
+                  ]).writeto(tmp_path / 'image.fits')
+    with pytest.raises(ValueError, match=r'image\.fits: file must hold a .*'
+                       'from_file takes the PSFs of other programs'):
+        GriddedMixturePSF.read(tmp_path / 'image.fits')
+
+
 def test_a_newer_version_is_refused_by_name(tmp_path):
     psf = make_grid()
     psf.write(tmp_path / 'a.fits')
