@@ -4,7 +4,9 @@ import re
 import astropy.units as u
 import numpy as np
 from astropy.io.fits.card import Undefined
+from astropy.io.fits.verify import VerifyError
 from astropy.time import Time
+from erfa import ErfaError
 
 _GAIN = ('GAIN', 'EGAIN', 'ATODGAIN', 'CCDGAIN')
 _READ_NOISE = ('RDNOISE', 'READNOIS', 'RON', 'READNSEA')
@@ -54,11 +56,17 @@ class Cards:
         """Return the first value there is for any of the keys, or None."""
         for key in keys:
             for header in self._headers:
-                value = header.get(key)
+                value = _value(header, key)
                 if value not in (None, '') and not isinstance(value,
                                                               Undefined):
                     return value
         return None
+
+    def check(self):
+        """Raise if what an image is read with cannot be read."""
+        for name in ('unit', 'gain', 'read_noise', 'exposure_time',
+                     'saturation', 'removed_sky', 'telescope', 'time'):
+            getattr(self, name)
 
     def number(self, *keys):
         """Return the first finite number there is, or None."""
@@ -150,6 +158,14 @@ class Cards:
             raise ValueError(msg) from error
 
 
+def _value(header, key):
+    try:
+        return header.get(key)
+    except VerifyError as error:
+        msg = f'the keyword {key} has a value that cannot be read'
+        raise ValueError(msg) from error
+
+
 def parse_unit(text):
     """Return the unit a header's word stands for, or None."""
     word = text.strip().lower().replace(' ', '')
@@ -199,7 +215,7 @@ def _believable(find, cards, scale):
     """Return the time that is found, None for what is no time of an image."""
     try:
         time = find(cards, scale)
-    except ValueError:
+    except ErfaError:
         # Of dates far away erfa does not know the leap seconds.
         return None
     return (time if time is not None and _OLDEST < time.mjd < _NEWEST

@@ -160,6 +160,7 @@ def _read_fits(path, ext, named):
         weight = _first(path, hdus, hdu, ('WHT',), {}, 'weight')
         covered = None if weight is None else _plane(path, weight) > 0
         cards = Cards(hdu.header, hdus[0].header)
+        cards.check()
         wcs, problem = None, None
         try:
             wcs = _fits_wcs(hdus, hdu)
@@ -270,11 +271,11 @@ def _celestial(wcs):
     wcs = wcs if wcs.naxis == 2 else wcs.celestial
     wcs.wcs.set()
     matrix = wcs.pixel_scale_matrix
-    if not np.isfinite([wcs.wcs.crval, wcs.wcs.crpix, *matrix]).all():
-        msg = 'its numbers must be finite'
-        raise ValueError(msg)
     if np.linalg.matrix_rank(matrix) < 2:
         msg = f'its matrix must not be singular, got {matrix.tolist()}'
+        raise ValueError(msg)
+    if not np.isfinite(wcs.all_pix2world([wcs.wcs.crpix], 1)).all():
+        msg = 'the reference pixel has no place on the sky'
         raise ValueError(msg)
     return wcs
 

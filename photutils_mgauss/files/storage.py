@@ -204,19 +204,19 @@ def read_stored(path):
     """
     import photutils_mgauss
     from photutils_mgauss.files.asdf_extension import CLASSES
-    stands_in_asdf = is_asdf(path)
-    with undamaged(path):
-        if stands_in_asdf:
+    if is_asdf(path):
+        with undamaged(path):
             found = _stored_in_asdf(path)
-            name = type(found[0]).__name__ if found else None
-        else:
-            with open_fits(path, 'undamaged') as hdus:
-                name = hdus[0].header.get('MGCLASS')
-        if name not in CLASSES:
-            msg = f'{path}: must hold a PSF of this package, got {name}'
-            raise UnusableFileError(msg)
-        return found[0] if stands_in_asdf else getattr(
-            photutils_mgauss, name).read(path)
+        if found:
+            return _only_one(found, path)
+        name = None
+    else:
+        with open_fits(path, 'undamaged') as hdus:
+            name = hdus[0].header.get('MGCLASS')
+    if name not in CLASSES:
+        msg = f'{path}: must hold a PSF of this package, got {name}'
+        raise UnusableFileError(msg)
+    return getattr(photutils_mgauss, name).read(path)
 
 
 def _plain_columns(hdu):
@@ -264,12 +264,22 @@ def _read_asdf(cls, file):
     name = name_of(file)
     with undamaged(name):
         found = _stored_in_asdf(file)
-    for value in found:
-        if isinstance(value, cls):
-            return value
-    names = ', '.join(type(value).__name__ for value in found)
-    _check_class(names, cls, name)
-    return None
+    wanted = {key: value for key, value in found.items()
+              if isinstance(value, cls)}
+    if not wanted:
+        names = ', '.join(type(value).__name__ for value in found.values())
+        _check_class(names, cls, name)
+    return _only_one(wanted, name)
+
+
+def _only_one(found, name):
+    """Return the object, if there is one only."""
+    if len(found) > 1:
+        msg = (f'{name}: must hold one object of this package, got '
+               f'{len(found)}, {", ".join(map(str, found))}; asdf.open gives '
+               'all of them by these names')
+        raise UnusableFileError(msg)
+    return next(iter(found.values()))
 
 
 def _stored_in_asdf(file):
@@ -282,5 +292,5 @@ def _stored_in_asdf(file):
         warnings.simplefilter('ignore', asdf.exceptions.
                               AsdfPackageVersionWarning)
         with open_asdf(file) as opened:
-            return [value for value in opened.tree.values()
-                    if type(value).__name__ in CLASSES]
+            return {key: value for key, value in opened.tree.items()
+                    if type(value).__name__ in CLASSES}

@@ -157,6 +157,27 @@ def test_files_of_others_are_refused(tmp_path):
             GriddedMixturePSF.read(tmp_path / name)
 
 
+def test_one_of_several_objects_is_not_taken_unasked(tmp_path):
+    one, two = make_grid(), make_grid(seed=4)
+    mixture = some_mixture(np.random.default_rng(1))
+    with enabled():
+        asdf.AsdfFile({'A1': one, 'B1': two, 'mean': mixture}).write_to(
+            tmp_path / 'a.asdf')
+    with pytest.raises(ValueError, match=r'a\.asdf: .* got 2, A1, B1; asdf'):
+        GriddedMixturePSF.read(tmp_path / 'a.asdf')
+    with pytest.raises(ValueError, match='got 3, A1, B1, mean; asdf'):
+        GriddedMixturePSF.from_file(tmp_path / 'a.asdf')
+    assert_same(GaussianMixture.read(tmp_path / 'a.asdf'), mixture)
+
+
+def test_images_with_extensions_are_refused_in_words(tmp_path):
+    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.ones((2, 2)), name='SCI')
+                  ]).writeto(tmp_path / 'image.fits')
+    with pytest.raises(ValueError, match=r'image\.fits: file must hold a .*'
+                       'from_file takes the PSFs of other programs'):
+        GriddedMixturePSF.read(tmp_path / 'image.fits')
+
+
 def test_a_newer_version_is_refused_by_name(tmp_path):
     psf = make_grid()
     psf.write(tmp_path / 'a.fits')

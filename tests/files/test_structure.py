@@ -155,7 +155,8 @@ def test_two_extensions_of_one_name_are_not_chosen_by_it(tmp_path):
 @pytest.mark.parametrize('cards', [
     {'CTYPE1': 'GLON-TAN', 'CTYPE2': 'DEC--TAN'},
     {'CD1_2': -1e-5, 'CD2_1': 1e-5},
-    {'CRVAL1': 1e999}])
+    {'CRVAL1': 1e999},
+    {'CRPIX2': 1e999}])
 def test_a_wcs_that_cannot_be_used_is_left_out_with_a_word(tmp_path, cards):
     hdu = fits.PrimaryHDU(DATA)
     hdu.header.update({'CTYPE1': 'RA---TAN', 'CTYPE2': 'DEC--TAN',
@@ -208,3 +209,22 @@ def test_an_absurd_time_is_no_time(tmp_path):
     hdu.header['EXPTIME'] = 10**30
     hdu.writeto(tmp_path / 'a.fits')
     assert read_layers(tmp_path / 'a.fits').cards.time is None
+
+
+@pytest.mark.parametrize('key', ['BUNIT', 'EXPTIME', 'DATE-OBS', 'GAIN'])
+def test_a_keyword_that_cannot_be_read_is_named(tmp_path, key):
+    hdu = fits.PrimaryHDU(DATA)
+    hdu.header[key] = 1.0
+    hdu.header['OTHER'] = 1.0
+    path = tmp_path / 'a.fits'
+    hdu.writeto(path)
+    content = path.read_bytes()
+    for name, is_read in (('OTHER', True), (key, False)):
+        at = content.index(f'{name:8}='.encode())
+        bad = f"{name:8}= 'no end of the text".ljust(80).encode()
+        path.write_bytes(content[:at] + bad + content[at + 80:])
+        if is_read:
+            assert_array_equal(read_layers(path).data, DATA)
+        else:
+            with pytest.raises(ValueError, match=rf'a\.fits: .*{key}'):
+                read_layers(path)

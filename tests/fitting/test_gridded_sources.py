@@ -3,16 +3,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from astropy.nddata import NDData
 from astropy.table import QTable
 from numpy.testing import assert_allclose, assert_array_equal
-from photutils.psf import (
-    EPSFBuilder,
-    EPSFStar,
-    EPSFStars,
-    GriddedPSFModel,
-    ImagePSF,
-)
+from photutils.psf import EPSFBuilder, EPSFStar, EPSFStars, ImagePSF
 
 from helpers.psf_grids import (
     PLACES,
@@ -143,11 +136,11 @@ def test_two_chips_side_by_side_have_a_seam():
 
 
 def two_chips():
-    """Return a grid of photutils with four nodes at two places."""
+    """Return nodes at one place, sorted as photutils 3.0 does."""
     data = epsf_grid().data[:1].repeat(8, axis=0)
-    places = [(x, y) for y in (0, 20, 20, 40) for x in (5, 9)]
-    return GriddedPSFModel(NDData(data, meta={'grid_xypos': places,
-                                              'oversampling': 3}))
+    places = sorted([(x, y) for y in (0, 20, 20, 40) for x in (5, 9)],
+                    key=lambda place: place[::-1])
+    return PlainGrid(data, {'grid_xypos': places, 'oversampling': 3})
 
 
 def no_lattice():

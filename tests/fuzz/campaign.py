@@ -359,7 +359,7 @@ def tables_of(value):
 
 
 def words_of(wcs):
-    return wcs.to_header_string(relax=True)
+    return [str(wcs), str(wcs.sip and [wcs.sip.a, wcs.sip.b])]
 
 
 def parts_of(layers):
