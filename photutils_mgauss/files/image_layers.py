@@ -109,8 +109,15 @@ def read_layers(path, *, ext=None, error_ext=None, flags_ext=None,
         If a file cannot be read or has no such image.
     """
     path = Path(path)
-    layers = (_read_asdf(path) if is_asdf(path) else
-              _read_fits(path, ext, {'error': error_ext, 'flags': flags_ext}))
+    named = {'error': error_ext, 'flags': flags_ext}
+    if is_asdf(path):
+        if any(named.values()):
+            msg = (f'{path}: must be FITS to have the extensions of '
+                   '--error-ext and --flags-ext, got ASDF')
+            raise ValueError(msg)
+        layers = _read_asdf(path)
+    else:
+        layers = _read_fits(path, ext, named)
     given = {kind: Path(file) for kind, file in (beside or {}).items()
              if file}
     return with_all_errors(path, _with_companions(path, layers, given))
