@@ -153,8 +153,7 @@ class Cards:
         try:
             return any_time(value, self._scale)
         except ValueError as error:
-            msg = (f'the keyword {key} must have a date, a Julian date or a '
-                   f'Julian year, got {value!r}')
+            msg = f'the keyword {key} must have a time: {error}'
             raise ValueError(msg) from error
 
 
@@ -224,6 +223,14 @@ def _believable(find, cards, scale):
 
 def any_time(value, scale):
     """Return the time that a number or text can only mean."""
+    try:
+        return _read_time(value, scale)
+    except ValueError as error:
+        msg = f'must be a date, a Julian date or a Julian year, got {value!r}'
+        raise ValueError(msg) from error
+
+
+def _read_time(value, scale):
     text = str(value).strip().upper()
     number = _NUMBER.fullmatch(text)
     if number is None:

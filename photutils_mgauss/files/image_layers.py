@@ -17,7 +17,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from astropy.wcs import WCS
 
 from photutils_mgauss.files.asdf_files import is_asdf, open_asdf
-from photutils_mgauss.files.damage import undamaged
+from photutils_mgauss.files.damage import UnusableFileError, undamaged
 from photutils_mgauss.files.fits_files import chosen_hdu, label_of, open_fits
 from photutils_mgauss.files.image_header import Cards
 
@@ -112,9 +112,9 @@ def read_layers(path, *, ext=None, error_ext=None, flags_ext=None,
         If a file cannot be read or has no such image.
     """
     path = Path(path)
+    named = {'error': error_ext, 'flags': flags_ext}
     with undamaged(path, _IMAGE):
-        named = {'error': error_ext, 'flags': flags_ext}
-        layers = (_read_asdf(path) if is_asdf(path)
+        layers = (_read_asdf_alone(path, named) if is_asdf(path)
                   else _read_fits(path, ext, named))
     given = {kind: Path(file) for kind, file in (beside or {}).items()
              if file}
@@ -339,6 +339,15 @@ def read_asdf_tree(path):
     """Return the tree of an ASDF file; damage becomes a ValueError."""
     with undamaged(path, 'an undamaged ASDF file'):
         return _asdf_tree(path)
+
+
+def _read_asdf_alone(path, named):
+    """Read an ASDF image, which has no extensions that could be named."""
+    if any(named.values()):
+        msg = (f'{path}: must be FITS to have the extensions of --error-ext '
+               'and --flags-ext, got ASDF')
+        raise UnusableFileError(msg)
+    return _read_asdf(path)
 
 
 def _read_asdf(path):
