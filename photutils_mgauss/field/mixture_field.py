@@ -30,7 +30,7 @@ __all__ = ['MixtureField']
 
 
 @storable(detector={'ny': 'pix', 'nx': 'pix', 'radius': 'pix',
-                    'accuracy': '', 'centre_stddev': 'pix'},
+                    'accuracy': ''},
           terms={'coefficient': ''}, errors={'covariance': ''},
           stars={'x': 'pix', 'y': 'pix', 'used': ''}, dropped={'id': ''})
 @dataclass(frozen=True, eq=False, repr=False)
@@ -145,12 +145,14 @@ class MixtureField(Field):
         residual = stars.pop('residual', None)
         exposures = (QTable(tables['exposures']) if 'exposures' in tables
                      else None)
+        # Files once held no centre other than that of the flux.
+        stddev = float(detector.get('centre_stddev', [np.inf])[0])
         return cls(coefficients.reshape(n_terms, -1, 6),
                    (int(detector['ny'][0]), int(detector['nx'][0])),
                    float(detector['radius'][0]), covariance.reshape(n, n),
                    QTable(stars), residual, float(detector['accuracy'][0]),
                    QTable(tables['dropped']), exposures=exposures,
-                   centre_stddev=float(detector['centre_stddev'][0]))
+                   centre_stddev=stddev)
 
     @property
     def n_components(self):
