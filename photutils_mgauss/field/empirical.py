@@ -144,8 +144,8 @@ class EmpiricalPSF:
         -------
         (n, n) `~numpy.ndarray`
             Flux densities [1 / pix^2] with the centre of the core in the
-            middle sample; the sum over ``oversampling``\ :sup:`2` is the share of
-            the flux in the image.
+            middle sample; the sum over ``oversampling``\ :sup:`2` is the
+            share of the flux in the image.
 
         Raises
         ------
