@@ -1,9 +1,10 @@
 """What all fields have in common, and the tables they report."""
 import numpy as np
+from astropy.stats import gaussian_sigma_to_fwhm
 from astropy.table import QTable
 
-from photutils_mgauss.field.forms import mixture_arrays
 from photutils_mgauss.field.normal import model_stamps, to_vector
+from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.image import with_unit
 from photutils_mgauss.utils.star_columns import words_column
@@ -18,6 +19,11 @@ class Field(ComparedByValue):
         used = int(np.count_nonzero(self.stars['used']))
         return (f'<{type(self).__name__}({details}degree={self.degree}, '
                 f'shape={self.shape}, {used} of {len(self.stars)} stars)>')
+
+    @property
+    def centre(self):
+        """What the origin of the mixtures is: 'core' or 'flux'."""
+        return 'flux' if np.isinf(self.centre_stddev) else 'core'
 
     @property
     def degree(self):
@@ -112,7 +118,7 @@ def residual_stars(fit):
     return residual
 
 
-def star_table(fit, sample):
+def star_table(fit, sample, centre_stddev):
     """Return the table of the stars that were fitted."""
     problem = fit.problem
     n_pixels = (problem.weights > 0).sum(axis=(1, 2))
@@ -121,7 +127,8 @@ def star_table(fit, sample):
     if len(sample.reasons) > 1:
         table['exposure'] = sample.exposure
     table['x'], table['y'] = sample.expected()
-    table['x_fit'], table['y_fit'], flux = _own_numbers(fit).T
+    table['x_fit'], table['y_fit'], flux = _own_numbers(
+        fit, centre_stddev).T
     table['flux_fit'] = with_unit(flux, sample.unit)
     table['local_bkg'] = with_unit(problem.sky, sample.unit)
     table['reduced_chi2'] = fit.equations.chi2 / np.maximum(n_pixels - 3, 1)
@@ -134,12 +141,21 @@ def star_table(fit, sample):
     return table
 
 
-def _own_numbers(fit):
+def _own_numbers(fit, centre_stddev):
     """Return x, y and flux of the stars, whose PSF is that of the result."""
-    own = fit.problem.sources[:, 0].copy()
+    problem = fit.problem
+    own = problem.sources[:, 0].copy()
+    shapes, sign = problem.form.shapes(fit.coefficients, problem.basis,
+                                       problem.local)
+    own[:, :2] -= problem.form.shifts(shapes, sign, problem.local,
+                                      centre_stddev)
     if fit.coefficients.ndim == 3:
         # The flux of a star is that of weights that sum to 1.
-        shapes = fit.problem.shapes(fit.coefficients)
-        own[:, :2] += mixture_arrays(shapes)[3]
         own[:, 2] *= np.exp(shapes[..., 0]).sum(axis=1)
     return own
+
+
+def core_width(mixture):
+    """Return the full width at half maximum of a mixture's core [pix]."""
+    size = np.sqrt(adaptive_moments(mixture).r2 / 2)
+    return float(size * gaussian_sigma_to_fwhm)

@@ -33,6 +33,9 @@ __all__ = ['EmpiricalPSF']
 # constant term; each degree has this fraction of the one before.
 _PRIOR_STDDEV = 0.03
 _PRIOR_FALL = 0.5
+# Steps towards the centre of the core: a moment under the weight, narrower
+# than the PSF and the weight, is about so much less than the offset.
+_CENTRE_STEPS, _CENTRE_GAIN = 4, 1.2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -141,9 +144,9 @@ class EmpiricalPSF(ComparedByValue):
         Returns
         -------
         (n, n) `~numpy.ndarray`
-            Flux densities [1 / pix^2] with the flux centroid in the middle
-            sample; the sum over ``oversampling``\ :sup:`2` is the share of
-            the flux in the image.
+            Flux densities [1 / pix^2] with the centre of the core in the
+            middle sample; the sum over ``oversampling``\ :sup:`2` is the
+            share of the flux in the image.
 
         Raises
         ------
@@ -155,12 +158,33 @@ class EmpiricalPSF(ComparedByValue):
                 else as_integer(oversampling, 'oversampling', minimum=1))
         half = self.coefficients.shape[1] // 2 * fine // self.oversampling
         steps = np.arange(-half, half + 1) / fine
+        return self._sampled(x, y, steps, *self._centre(x, y))
+
+    def _sampled(self, x, y, steps, x_0, y_0):
+        """Return the PSF at steps about a point, (n, n)."""
         basis = stages.polynomials(*normalised([x], [y], self.field.shape),
                                    self.degree)[0]
         lattice = np.tensordot(basis, self.coefficients, 1)
-        taps = _taps(steps, self.oversampling, len(lattice)).toarray()
-        smooth = self.field.mixture_at(x, y).evaluate(steps, steps[:, None])
-        return smooth + taps @ lattice @ taps.T
+        along_x, along_y = (_taps(steps + offset, self.oversampling,
+                                  len(lattice)) for offset in (x_0, y_0))
+        smooth = self.field.mixture_at(x, y).evaluate(
+            steps + x_0, steps[:, None] + y_0)
+        return smooth + along_y @ lattice @ along_x.toarray().T
+
+    def _centre(self, x, y):
+        """Return where the core is about the field's origin (x, y)."""
+        half = self.coefficients.shape[1] // 2 // self.oversampling
+        steps = np.arange(-half, half + 1 / 8, 1 / 4)
+        weight = np.exp(-steps**2 / (2 * self.field.centre_stddev**2))
+        centre = np.zeros(2)
+        # The moment falls by about this much with each pixel.
+        for _ in range(_CENTRE_STEPS):
+            light = (weight * self._sampled(x, y, steps, *centre)
+                     * weight[:, None])
+            moment = np.array([(light * steps).sum(),
+                               (light * steps[:, None]).sum()]) / light.sum()
+            centre = centre + _CENTRE_GAIN * moment
+        return centre
 
     def to_gridded_psf(self, grid_shape=(30, 30), *, oversampling=None):
         """

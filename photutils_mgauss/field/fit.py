@@ -11,6 +11,7 @@ from astropy.table import QTable
 
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import (
+    core_width,
     covariance_of,
     residual_stars,
     star_table,
@@ -21,7 +22,7 @@ from photutils_mgauss.field.input import possible_degree, read_sample
 from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.field.normal import Workers
 from photutils_mgauss.field.tuned_field import TunedMixtureField, known_shapes
-from photutils_mgauss.utils.validation import as_integer, as_real
+from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 
 __all__ = ['fit_mixture_field']
 
@@ -32,7 +33,7 @@ _DEGREE, _TUNED_DEGREE = 4, 1
 def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
                       degree=None, radius=10, local_bkg=False,
                       effective_gain=None, reject=True, regularization=1.0,
-                      start=None, executor=None):
+                      start=None, centre='core', executor=None):
     """
     Fit a PSF field to the pixels of stars.
 
@@ -93,6 +94,13 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
         a Gaussian that it is convolved with, and a change of its wings and
         of its asymmetry, polynomials of position; ``n_components`` does not
         count then. Fifteen stars are enough.
+    centre : {'core', 'flux'}, optional
+        What is at the origin of the PSF, which is where positions of stars
+        are: the point about which the first moment vanishes under a Gaussian
+        weight as large as the core of the PSF, its standard deviation the
+        full width at half maximum in the middle of the detector; or the flux
+        centroid, which wanders from image to image with the noise of the
+        wings. With ``start`` it stays where that of ``start`` is.
     executor : `~concurrent.futures.Executor`, optional
         Where stars are worked on; by default a pool of threads.
 
@@ -127,6 +135,7 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
     radius = as_real(radius, 'radius', minimum=2)
     options = {'strength': as_real(regularization, 'regularization', above=0),
                'reject': reject}
+    as_choice(centre, 'centre', ('core', 'flux'))
     sample = read_sample(data, stars, error, mask, radius, effective_gain)
     top = possible_degree(degree, len(sample.row))
     problem = sample.problem(top, local_bkg)
@@ -134,10 +143,10 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
         if start is not None:
             fit = stages.tune(_known(problem, sample, start), top, workers,
                               **options)
-            return _tuned(fit, sample, start, radius)
+            return _tuned(fit, sample, start, radius, centre)
         fit, choice = _free(problem, n_components, degree, top, workers,
                             options)
-    return _result(fit, sample, radius, choice)
+    return _result(fit, sample, radius, choice, centre)
 
 
 def _free(problem, n_components, degree, top, workers, options):
@@ -167,20 +176,34 @@ def _known(problem, sample, start):
     return replace(problem, form=TunedShapes(), local=local)
 
 
-def _tuned(fit, sample, start, radius):
+def _tuned(fit, sample, start, radius, centre):
     sample = sample.without_deviant(fit.problem.used)
+    stddev = _centre_stddev(start.mixture_at(*_middle(sample)), centre)
     return TunedMixtureField(
         start, fit.coefficients, sample.shape, radius, covariance_of(fit),
-        star_table(fit, sample), residual_stars(fit), fit.accuracy,
-        sample.dropped())
+        star_table(fit, sample, stddev), residual_stars(fit), fit.accuracy,
+        sample.dropped(), stddev)
 
 
-def _result(fit, sample, radius, choice):
+def _result(fit, sample, radius, choice, centre):
     sample = sample.without_deviant(fit.problem.used)
-    return MixtureField(
-        fit.coefficients, sample.shape, radius, covariance_of(fit),
-        star_table(fit, sample), residual_stars(fit), fit.accuracy,
-        sample.dropped(), choice, _exposure_table(fit, len(sample.reasons)))
+    field = MixtureField(
+        fit.coefficients, sample.shape, radius, covariance_of(fit), None,
+        residual_stars(fit), fit.accuracy, sample.dropped(), choice,
+        _exposure_table(fit, len(sample.reasons)))
+    stddev = _centre_stddev(field.mixture_at(*_middle(sample)), centre)
+    return replace(field, stars=star_table(fit, sample, stddev),
+                   centre_stddev=stddev)
+
+
+def _middle(sample):
+    """Return the middle x, y of the detector."""
+    return [(n - 1) / 2 for n in sample.shape[::-1]]
+
+
+def _centre_stddev(mixture, centre):
+    """Return the size of the weight under which a PSF is centred."""
+    return core_width(mixture) if centre == 'core' else np.inf
 
 
 def _exposure_table(fit, n):

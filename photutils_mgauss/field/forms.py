@@ -9,20 +9,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from photutils_mgauss.psf.centre import centres, flux_centroids
 from photutils_mgauss.psf.rows import covariances_of_logs
 
 # Steps of numerical derivatives.
 _STEP = 1e-5
 
 
-def mixture_arrays(shapes):
-    """Return weights, means, covariances and shifts for (n, K, 6)."""
+def mixture_arrays(shapes, stddev=np.inf):
+    """
+    Return weights, means, covariances and shifts for (n, K, 6).
+
+    The centre under a weight of size ``stddev`` [pix] is shifted to 0.
+    """
     log_weights = shapes[..., 0] - shapes[..., 0].max(axis=-1, keepdims=True)
     weights = np.exp(log_weights)
     weights /= weights.sum(axis=-1, keepdims=True)
-    shift = np.einsum('nk,nki->ni', weights, shapes[..., 1:3])
-    means = shapes[..., 1:3] - shift[:, None]
-    return weights, means, covariances_of_logs(shapes), shift
+    covariances = covariances_of_logs(shapes)
+    shift = centres(weights, shapes[..., 1:3], covariances, stddev)
+    return weights, shapes[..., 1:3] - shift[:, None], covariances, shift
 
 
 def convolved(shapes, blur):
@@ -74,6 +79,11 @@ class FreeShapes:
     # Log weight, means and precisions vary by different amounts.
     kinds = np.array([0, 1, 1, 2, 2, 2])
 
+    @staticmethod
+    def shifts(shapes, sign, local, stddev):
+        """Return what moves the centre of shapes to 0, (n, 2)."""
+        return -mixture_arrays(shapes, stddev)[3]
+
     def shapes(self, coefficients, basis, local):
         """Return the shapes at the stars, and the signs of the weights."""
         shapes = np.einsum('nt,tki->nki', basis, coefficients)
@@ -123,13 +133,23 @@ class TunedShapes:
                        / weight.sum(axis=-1, keepdims=True))
         return np.concatenate([shapes, sign[..., None], size[..., None]], -1)
 
+    @staticmethod
+    def shifts(shapes, sign, local, stddev):
+        """Return what moves the centre of shapes to the known one's."""
+        known, changed = (centres(sign * np.exp(each[..., 0]),
+                                  each[..., 1:3], covariances_of_logs(each),
+                                  stddev)
+                          for each in (local[..., :6], shapes))
+        return known - changed
+
     def shapes(self, coefficients, basis, local):
         """Return the shapes at the stars, and the signs of the weights."""
         return self._changed(basis @ coefficients, local), local[..., 6]
 
     def _changed(self, numbers, local):
         shapes, sign, size = local[..., :6], local[..., 6], local[..., 7]
-        before = _centroid(shapes, sign)
+        before = flux_centroids(sign * np.exp(shapes[..., 0]),
+                                shapes[..., 1:3])
         shapes = convolved(shapes, numbers[:, :3])
         if numbers.shape[1] == 3:
             return shapes
@@ -137,7 +157,9 @@ class TunedShapes:
         shapes[..., 1:3] += numbers[:, None, 4:6] * size[..., None]
         total = np.sum(sign * np.exp(shapes[..., 0]), axis=1, keepdims=True)
         shapes[..., 0] -= np.log(np.maximum(total, 1e-300))
-        shapes[..., 1:3] += (before - _centroid(shapes, sign))[:, None]
+        after = flux_centroids(sign * np.exp(shapes[..., 0]),
+                               shapes[..., 1:3])
+        shapes[..., 1:3] += (before - after)[:, None]
         return shapes
 
     def jacobians(self, coefficients, basis, local):
@@ -154,8 +176,3 @@ class TunedShapes:
             out.append(slope.reshape(len(slope), -1)[:, 3:])
         return np.ascontiguousarray(np.stack(out, axis=-1))
 
-
-def _centroid(shapes, sign):
-    weight = sign * np.exp(shapes[..., 0])
-    return (np.einsum('nk,nki->ni', weight, shapes[..., 1:3])
-            / weight.sum(axis=1)[:, None])

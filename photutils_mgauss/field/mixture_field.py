@@ -38,8 +38,8 @@ class MixtureField(Field):
     r"""
     A mixture of Gaussians whose parameters are polynomials of position.
 
-    Made by `fit_mixture_field`. The flux centroid of the mixture at every
-    position is its origin, and its weights sum to 1.
+    Made by `fit_mixture_field`. The centre of the mixture at every position
+    is its origin, and its weights sum to 1.
 
     Parameters
     ----------
@@ -78,6 +78,10 @@ class MixtureField(Field):
         If the stars are from several exposures, the covariance that each
         one adds to all Gaussians, ``xx``, ``xy``, ``yy`` [pix^2], about the
         mean of all, and its errors ``xx_err``, ``xy_err``, ``yy_err``.
+    centre_stddev : float, optional
+        The size w of the Gaussian weight under which the PSF's first moment
+        about its origin vanishes [pix]; infinite, the default, where the
+        origin is the flux centroid.
 
     Examples
     --------
@@ -109,6 +113,7 @@ class MixtureField(Field):
     dropped: QTable = field(default=None)
     choice: QTable = field(default=None)
     exposures: QTable = field(default=None)
+    centre_stddev: float = np.inf
 
     def __repr__(self):
         return self._described(f'n_components={self.n_components}, ')
@@ -122,7 +127,8 @@ class MixtureField(Field):
             [], str)}) if self.dropped is None else self.dropped
         tables = {'detector': {'ny': [ny], 'nx': [nx],
                              'radius': [float(self.radius)],
-                             'accuracy': [float(self.accuracy)]},
+                             'accuracy': [float(self.accuracy)],
+                             'centre_stddev': [float(self.centre_stddev)]},
                 'terms': {'coefficient': self.coefficients},
                 'errors': {'covariance': self.covariance},
                 'stars': stars, 'dropped': table_columns(dropped)}
@@ -139,11 +145,14 @@ class MixtureField(Field):
         residual = stars.pop('residual', None)
         exposures = (QTable(tables['exposures']) if 'exposures' in tables
                      else None)
+        # Files once held no centre other than that of the flux.
+        stddev = float(detector.get('centre_stddev', [np.inf])[0])
         return cls(coefficients.reshape(n_terms, -1, 6),
                    (int(detector['ny'][0]), int(detector['nx'][0])),
                    float(detector['radius'][0]), covariance.reshape(n, n),
                    QTable(stars), residual, float(detector['accuracy'][0]),
-                   QTable(tables['dropped']), exposures=exposures)
+                   QTable(tables['dropped']), exposures=exposures,
+                   centre_stddev=stddev)
 
     @property
     def n_components(self):
@@ -164,8 +173,7 @@ class MixtureField(Field):
         Returns
         -------
         GaussianMixture
-            Of K Gaussians, its flux centroid at the origin. It contains the
-            pixel.
+            Of K Gaussians, its centre at the origin. It contains the pixel.
 
         Raises
         ------
@@ -177,12 +185,12 @@ class MixtureField(Field):
         return GaussianMixture(weights[0], means[0], covariances[0])
 
     def _mixtures(self, x, y, exposure):
-        """Return stacked weights, means, covariances and centroids."""
+        """Return stacked weights, means, covariances and shifts."""
         basis = stages.polynomials(*normalised(x, y, self.shape), self.degree)
         shapes = np.einsum('nt,tki->nki', basis, self.coefficients)
         if exposure is not None:
             shapes = convolved(shapes, self._blur(exposure))
-        return mixture_arrays(shapes)
+        return mixture_arrays(shapes, self.centre_stddev)
 
     def _blur(self, exposure):
         n = 1 if self.exposures is None else len(self.exposures)

@@ -39,9 +39,8 @@ class TunedMixtureField(Field):
     """
     A known PSF with changes that are polynomials of position.
 
-    Made by `fit_mixture_field` with ``start``. The flux centroid of the PSF
-    is where that of ``start`` is, so that positions keep the archive's
-    convention.
+    Made by `fit_mixture_field` with ``start``. The centre of the PSF is where
+    that of ``start`` is, so that positions keep the archive's convention.
 
     Parameters
     ----------
@@ -56,6 +55,8 @@ class TunedMixtureField(Field):
         As in `MixtureField`.
     covariance : (6 T, 6 T) `~numpy.ndarray`
         Of the coefficients, change by change and term by term within one.
+    centre_stddev
+        As in `MixtureField`.
 
     Examples
     --------
@@ -85,6 +86,7 @@ class TunedMixtureField(Field):
     residual_stars: np.ndarray = field(default=None)
     accuracy: float = 0.0
     dropped: QTable = field(default=None)
+    centre_stddev: float = np.inf
 
     def __repr__(self):
         return self._described()
@@ -142,11 +144,12 @@ class TunedMixtureField(Field):
             Of as many Gaussians as ``start`` has there. It contains the
             pixel.
         """
+        known = known_shapes(self.start, [x], [y])
         shapes, sign = TunedShapes().shapes(
-            self.coefficients, self._basis(x, y),
-            known_shapes(self.start, [x], [y]))
+            self.coefficients, self._basis(x, y), known)
+        shift = TunedShapes.shifts(shapes, sign, known, self.centre_stddev)
         return GaussianMixture(sign[0] * np.exp(shapes[0, :, 0]),
-                               shapes[0, :, 1:3],
+                               shapes[0, :, 1:3] + shift,
                                covariances_of_logs(shapes[0]))
 
     def to_grid(self, grid_shape=None):

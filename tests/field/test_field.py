@@ -61,7 +61,7 @@ def noisy(clean, rng, sky=30.0):
 def field(stars, clean):
     data, error, _ = noisy(clean, np.random.default_rng(5))
     return fit_mixture_field(data, stars, error=error, n_components=2,
-                             degree=1, radius=8)
+                             degree=1, radius=8, centre='flux')
 
 
 def profile_error(field, x, y):
@@ -76,7 +76,8 @@ def profile_error(field, x, y):
 
 def test_without_noise_the_field_is_the_truth(stars, clean):
     field = fit_mixture_field(clean, stars, error=np.full(SHAPE, 10.0),
-                              n_components=2, degree=2, radius=8)
+                              n_components=2, degree=2, radius=8,
+                              centre='flux')
     for x, y in [(20, 20), (120, 100), (220, 180), (200, 30)]:
         assert profile_error(field, x, y) < 3e-3
 
@@ -201,7 +202,7 @@ def test_cosmic_rays_are_left_out(stars, clean):
     data[hit] += 2000
     error[hit] = np.sqrt(error[hit] ** 2 + 2000)
     field = fit_mixture_field(data, stars, error=error, n_components=2,
-                              degree=1, radius=8)
+                              degree=1, radius=8, centre='flux')
     y, x = np.nonzero(hit)
     near = [np.hypot(x - x_0, y - y_0) <= 8.5 for x_0, y_0 in
             np.rint([stars['x'], stars['y']]).T]
