@@ -114,9 +114,9 @@ def _offset(one, two):
     """Return by how much one PSF fitted with another is displaced."""
     x = np.arange(-4, 4.1)
     y = x[:, None]
-    slope = np.moveaxis(two.gradient(x + 0 * y, y + 0 * x), 0, -1)
+    slope = two.gradient(x + 0 * y, y + 0 * x)
     design = np.column_stack([two.evaluate(x, y).ravel(),
-                              slope.reshape(-1, 2)])
+                              -slope.reshape(-1, 2)])
     flux, *moved = np.linalg.lstsq(design, one.evaluate(x, y).ravel())[0]
     return np.array(moved) / flux
 
