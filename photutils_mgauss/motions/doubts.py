@@ -1,7 +1,7 @@
 """What makes a solution doubtful, in sentences that say what to look at."""
 import numpy as np
 
-from photutils_mgauss.sky.space_motion import UNKNOWN
+from photutils_mgauss.sky.space_motion import NO_ERROR
 
 FAR = 7.0     # times the detections' errors: no systematic error is so large
 DISTANT = 60e3  # mas: no pointing is off by more
@@ -59,7 +59,7 @@ def _without_errors(fit):
             ('motions', slice(2, 4), moving, 'pmra_error')):
         known = among & np.isfinite(catalogue.values[rows]).all(axis=0)
         variance = np.einsum('kkn->kn', catalogue.covariance)[rows]
-        if known.any() and not (variance[:, known] < UNKNOWN).any():
+        if known.any() and not (variance[:, known] < NO_ERROR).any():
             yield (f'The {what} of the reference objects are not used, '
                    'because the table has no errors of them (a column like '
                    f'{column!r}).')

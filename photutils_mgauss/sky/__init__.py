@@ -5,10 +5,11 @@ The sky as planes, maps and observers; it knows no star.
 goes from pixels to the sky and back through any WCS, `transforms` maps one
 plane onto another, from shifts to polynomials, `common_points` finds one
 from objects on both planes, `correction` is what such a map does to
-directions, `corrected_wcs` puts it into a WCS, and `observers` has times,
-places of observers and aberration. Angles and times enter as astropy's
-Quantity, Time and SkyCoord and leave as plain radians, years and unit
-vectors, of which all that the room `motions` does is made.
+directions, `corrected_wcs` puts it into a WCS, `space_motion` is how places
+on a plane move, and `observers` has times, places of observers and
+aberration. Angles and times enter as astropy's Quantity, Time and SkyCoord
+and leave as plain radians, years and unit vectors, of which all that the
+room `motions` does is made.
 """
 from photutils_mgauss.utils.lazy import hand_on
 

@@ -20,7 +20,7 @@ from photutils_mgauss.sky.tangent_plane import MAS, directions
 
 # km/s of one au in a year, for parallaxes in radians.
 PER_DISTANCE = 1 / (4.740470446 * MAS)
-UNKNOWN = 1e27  # mas^2
+NO_ERROR = 1e27  # mas^2: a variance that says that nothing is known
 
 
 def moved(values, velocity, dt):
@@ -91,7 +91,7 @@ def carried(values, covariance, velocity, years, year):
     Return values (5, n), covariances and years of stars at one ``year``.
 
     Stars of which anything is unknown (NaN) stay as they are; a variance
-    above `UNKNOWN` of a parallax says that its error is not known.
+    above `NO_ERROR` of a parallax says that its error is not known.
     """
     space = np.isfinite(values).all(axis=0) & np.isfinite(velocity + years)
     if not space.any():
@@ -101,7 +101,7 @@ def carried(values, covariance, velocity, years, year):
     turn = jacobian(old, speed, dt)
     values, covariance, years = values.copy(), covariance.copy(), years.copy()
     # A parallax without an error is taken as it is.
-    turn[:4, 4] *= covariance[4, 4, space] < UNKNOWN
+    turn[:4, 4] *= covariance[4, 4, space] < NO_ERROR
     values[:, space], years[space] = moved(old, speed, dt), year
     covariance[..., space] = np.einsum(
         'ijn,jkn,lkn->iln', turn, covariance[..., space], turn)
