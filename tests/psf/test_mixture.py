@@ -321,13 +321,16 @@ def test_equality_is_that_of_the_numbers():
         return GaussianMixture.from_stddevs(
             [0.7, 0.3], [(0, 0), (0.2, -0.1)], [(1.0, width), (2.4, 2.0)])
     one = make()
-    assert one == make() and hash(one) == hash(make())
+    assert one == make()
+    assert hash(one) == hash(make())
     assert one == copy.deepcopy(one) == pickle.loads(pickle.dumps(one))
-    assert one != make(1.2) and one != 3
+    assert one != make(1.2)
+    assert one != 3
     assert len({one, make(), make(1.2)}) == 2
     negative = GaussianMixture([1], [[-0.0, 0]], [np.eye(2)])
     zero = GaussianMixture([1], [[0.0, 0]], [np.eye(2)])
-    assert negative == zero and hash(negative) == hash(zero)
+    assert negative == zero
+    assert hash(negative) == hash(zero)
 
 
 def test_correlations_are_zero_if_not_given():
