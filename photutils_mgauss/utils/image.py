@@ -119,8 +119,9 @@ def read_pixels(data, error=None, mask=None, *, name='data', broadcast=False):
     -----
     AstropyUserWarning
         If no pixel can be used: all are masked, not finite, or have an error
-        that is not positive and finite. If a large part of the image holds one value only beside pixels with
-        noise or a sky, as mosaics have it where there is no data.
+        that is not positive and finite. If a large part of the image holds
+        one value only beside pixels with noise or a sky, as mosaics have it
+        where there is no data.
     """
     pixels = _read(data, error, mask, name, (2,), broadcast)
     _warn_of_nothing(pixels, name)
