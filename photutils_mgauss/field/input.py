@@ -18,6 +18,9 @@ from photutils_mgauss.utils.star_columns import read_sources
 # Neighbours may be this far off their catalogue positions [pix].
 _NEIGHBOUR_STDDEV = 0.5
 _MAX_NEIGHBOURS = 12
+# What is light and what noise, for one star and for all together [standard
+# deviations].
+_SEEN, _SEEN_TOGETHER = 3.0, 5.0
 # Stars needed for each term of the polynomials, beyond the first.
 _STARS_PER_TERM = 2
 
@@ -112,6 +115,7 @@ def read_sample(data, stars, error, mask, radius, gain):
                f'got none of {sum(part[2].x.size for part in parts)}: they '
                f'are outside the image, masked, or too near the edge')
         raise ValueError(msg)
+    _check_light(stamps)
     most = max(part[4].shape[1] for part in parts)
     return Sample(
         stamps, np.concatenate([
@@ -122,6 +126,24 @@ def read_sample(data, stars, error, mask, radius, gain):
         np.concatenate([part[1] for part in parts]),
         [part[3] for part in parts], exposures[0][0].shape,
         [part[2] for part in parts], exposures[0][0].unit)
+
+
+def _check_light(stamps):
+    """Raise if there is no light at the places of the stars, or negative."""
+    pulls = stamps.light_over_noise()
+    bright = np.count_nonzero(pulls > _SEEN)
+    dark = np.count_nonzero(pulls < -_SEEN)
+    if dark > bright:
+        msg = (f'data must have positive stars, got {dark} of {pulls.size} '
+               'negative ones: negate the image, or do not subtract another '
+               'one')
+        raise ValueError(msg)
+    together = pulls.sum() / np.sqrt(pulls.size)
+    if together < _SEEN_TOGETHER:
+        msg = (f'data must have light at the places of the {pulls.size} '
+               f'stars, got no more than noise ({together:.1f} times its '
+               'standard deviation in all): check the positions')
+        raise ValueError(msg)
 
 
 def _exposures(data, stars, error, mask):

@@ -2,9 +2,13 @@
 from dataclasses import dataclass, fields
 
 import numpy as np
+from astropy.stats import mad_std
 
 from photutils_mgauss.utils.image import photon_slope
 
+# Light is looked for inside this radius, its sky and noise in the ring outside
+# this share of the stamp's radius [pix].
+_CORE, _RING = 2.5, 0.6
 # A stamp is used if its middle 3x3 pixels and this share of the rest are.
 _MIN_GOOD = 0.5
 
@@ -55,6 +59,26 @@ class Stamps:
         """Return the distance of each pixel from the middle one, (s, s)."""
         steps = np.arange(-self.radius, self.radius + 1)
         return np.hypot(steps, steps[:, None])
+
+    def light_over_noise(self):
+        """
+        Return the light at the middle over its own noise, (n,).
+
+        Sky and noise are those of the ring around it, whatever the errors
+        say.
+        """
+        distance = self.offsets()
+        core = self.good & (distance <= _CORE)
+        ring = self.good & (distance > max(_CORE, _RING * self.radius))
+        pulls = np.zeros(len(self.data))
+        for i, (data, inner, outer) in enumerate(zip(self.data, core, ring,
+                                                     strict=True)):
+            around = data[outer] if outer.any() else np.zeros(1)
+            n = np.count_nonzero(inner)
+            light = data[inner].sum() - n * np.median(around)
+            noise = np.sqrt(n * (1 + n / around.size)) * mad_std(around)
+            pulls[i] = light / max(noise, 1e-6 * abs(light), 1e-300)
+        return pulls
 
     def usable(self):
         """Return which stamps have enough pixels, the middle ones of all."""

@@ -113,17 +113,18 @@ def read_pixels(data, error=None, mask=None, *, name='data', broadcast=False):
     Raises
     ------
     TypeError, ValueError
-        If an argument is not valid, or no pixel can be used: all are masked,
-        not finite, or have an error that is not positive and finite.
+        If an argument is not valid.
 
     Warns
     -----
     AstropyUserWarning
-        If a large part of the image holds one value only beside pixels with
-        noise or a sky, as mosaics have it where there is no data.
+        If no pixel can be used: all are masked, not finite, or have an error
+        that is not positive and finite. If a large part of the image holds
+        one value only beside pixels with noise or a sky, as mosaics have it
+        where there is no data.
     """
     pixels = _read(data, error, mask, name, (2,), broadcast)
-    _check_usable(pixels, name)
+    _warn_of_nothing(pixels, name)
     _warn_of_padding(pixels, name)
     return pixels
 
@@ -373,8 +374,8 @@ def _factor(own, unit, name, data_name):
 
 # Images that cannot be what the user believes.
 
-def _check_usable(pixels, name):
-    """Raise if not a single pixel can be used."""
+def _warn_of_nothing(pixels, name):
+    """Warn if not a single pixel can be used."""
     step = max(1, _BLOCK // pixels.shape[1])
     for first in range(0, pixels.shape[0], step):
         rows = np.s_[first:first + step]
@@ -393,8 +394,8 @@ def _check_usable(pixels, name):
     else:
         why = ('all are masked or not finite, or have an error that is not '
                'positive and finite')
-    msg = f'{name} must have pixels that can be used, got none: {why}'
-    raise ValueError(msg)
+    warnings.warn(f'{name} has no pixel that can be used: {why}',
+                  AstropyUserWarning, stacklevel=4)
 
 
 def _warn_of_padding(pixels, name):

@@ -7,6 +7,7 @@ import pytest
 from astropy import units as u
 from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import Table
+from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 
@@ -453,8 +454,10 @@ def test_noise_alone_holds_no_stars():
 @pytest.mark.parametrize('mask', [True, False])
 def test_an_image_without_pixels_gives_an_empty_table(mask):
     data = np.full((40, 40), 1.0 if mask else np.nan)
-    table = photometry()(data, error=np.ones((40, 40)),
-                         mask=np.full((40, 40), mask))
+    words = 'all are masked' if mask else 'all are NaN or infinite'
+    with pytest.warns(AstropyUserWarning, match=words):
+        table = photometry()(data, error=np.ones((40, 40)),
+                             mask=np.full((40, 40), mask))
     assert len(table) == 0
     assert 'x_fit' in table.colnames
 

@@ -7,7 +7,12 @@ from astropy.table import Table
 from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_allclose
 
-from photutils_mgauss import GaussianMixture, fit_mixture_field
+from photutils_mgauss import (
+    EmpiricalPSF,
+    GaussianMixture,
+    GriddedMixturePSF,
+    fit_mixture_field,
+)
 from photutils_mgauss.field.forms import FreeShapes
 from photutils_mgauss.field.normal import (
     FieldProblem,
@@ -249,8 +254,22 @@ def test_too_few_stars_lower_the_degree_with_a_warning(stars, clean):
 
 
 def test_no_usable_star_is_an_error_that_says_how_many(stars, clean):
+    mask = np.ones(SHAPE, bool)
+    mask[0, 0] = False
     with pytest.raises(ValueError, match='at least 1 star'):
-        fit_mixture_field(clean, stars, mask=np.ones(SHAPE, bool))
+        fit_mixture_field(clean, stars, mask=mask)
+
+
+def test_negative_stars_and_noise_are_not_fitted(stars, clean, rng):
+    noise = rng.normal(size=SHAPE)
+    for start in (None, GriddedMixturePSF([GaussianMixture(
+            [1], [[0, 0]], [np.eye(2)])], [(0, 0)])):
+        with pytest.raises(ValueError, match='negate the image'):
+            fit_mixture_field(noise - clean, stars, start=start)
+        with pytest.raises(ValueError, match='no more than noise'):
+            fit_mixture_field(noise, stars, start=start)
+    with pytest.raises(ValueError, match='negate the image'):
+        EmpiricalPSF.from_stars(noise - clean, stars)
 
 
 @pytest.mark.parametrize(('arguments', 'text'), [

@@ -4,8 +4,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from astropy.table import QTable
+from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_allclose, assert_array_equal
 from photutils.psf import EPSFBuilder, EPSFStar, EPSFStars, ImagePSF
+from scipy.ndimage import uniform_filter
+from scipy.special import j1
 
 from helpers.psf_grids import (
     PLACES,
@@ -47,7 +50,8 @@ def test_the_report_tells_what_too_few_gaussians_cost():
         [0.6, 0.4], [[0, 0], [0.1, 0]], [[0.45, 0.5], [1, 1]], [0, 0])
     steps = np.arange(-40, 41) / 4
     image = ImagePSF(truth.evaluate(steps, steps[:, None]), oversampling=4)
-    psf = GriddedMixturePSF.from_image_psf(image, 1)
+    with pytest.warns(AstropyUserWarning, match='fluxes measured with these'):
+        psf = GriddedMixturePSF.from_image_psf(image, 1)
     mixture, scale = psf.mixtures[0], psf.scales[0]
     # The pixel-phase error by hand: stars of the truth, measured with the
     # mixture.
@@ -64,6 +68,49 @@ def test_the_report_tells_what_too_few_gaussians_cost():
             rcond=None)[0][1])
     assert np.ptp(shifts) > 0.01
     assert_allclose(psf.report['phase_error'], np.ptp(shifts) / 2, rtol=0.3)
+    # That of the flux of a faint star, in 5 x 5 pixels around the star.
+    fluxes = []
+    pixels = np.arange(-2.0, 3)
+    for i, j in np.ndindex(8, 8):
+        phase = np.array([i, j]) / 8 - 0.5
+        x, y = np.meshgrid(pixels + phase[0], pixels + phase[1])
+        design = np.stack([mixture.evaluate(x, y),
+                           *np.moveaxis(mixture.gradient(x, y), -1, 0)])
+        fluxes.append(np.linalg.lstsq(
+            design.reshape(3, -1).T, truth.evaluate(x, y).ravel(),
+            rcond=None)[0][0])
+    faint = np.std(fluxes) / np.mean(fluxes)
+    assert faint > 0.003
+    assert_allclose(psf.report['flux_phase_error'], faint, rtol=0.05)
+
+
+def airy_grid(fwhm, obscuration, oversampling=4, fine=20, half=11):
+    """Return a grid of Airy patterns integrated over square pixels."""
+    n = (half + 1) * fine
+    steps = np.arange(-n, n + 1) / fine
+    r = np.pi * np.hypot(*np.meshgrid(steps, steps)) / (fwhm / 1.029) + 1e-9
+    light = (2 * j1(r) / r - obscuration * 2 * j1(obscuration * r) / r) ** 2
+    pixel = (uniform_filter(light, fine)
+             + uniform_filter(light, fine + 1)) / 2
+    cut = slice(fine, -fine, fine // oversampling)
+    image = pixel[cut, cut] * oversampling**2 / pixel[cut, cut].sum()
+    return PlainGrid(image[None], {'grid_xypos': [(0, 0)],
+                                   'oversampling': oversampling})
+
+
+@pytest.mark.parametrize(('fwhm', 'obscuration'), [(1.0, 0.0), (1.25, 0.3)])
+def test_defaults_keep_the_fluxes_of_undersampled_airy_patterns(
+        fwhm, obscuration):
+    psf = GriddedMixturePSF.from_gridded_psf(airy_grid(fwhm, obscuration))
+    assert psf.n_components > 3
+    assert psf.report['flux_phase_error'][0] < 0.003
+
+
+def test_the_default_stays_at_three_where_three_do():
+    psf = GriddedMixturePSF.from_gridded_psf(epsf_grid())
+    three = GriddedMixturePSF.from_gridded_psf(epsf_grid(), 3)
+    assert psf.n_components == 3
+    assert psf.mixtures == three.mixtures
 
 
 def test_blank_nodes_are_bridged_and_reported():

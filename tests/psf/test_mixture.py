@@ -314,3 +314,29 @@ def test_a_star_far_away_leaves_an_empty_image():
     for integrated in (False, True):
         image = mixture.render((5, 5), 1e6, -1e6, pixel_integrated=integrated)
         assert_array_equal(image, 0)
+
+
+def test_equality_is_that_of_the_numbers():
+    def make(width=1.1):
+        return GaussianMixture.from_stddevs(
+            [0.7, 0.3], [(0, 0), (0.2, -0.1)], [(1.0, width), (2.4, 2.0)])
+    one = make()
+    assert one == make()
+    assert hash(one) == hash(make())
+    assert one == copy.deepcopy(one) == pickle.loads(pickle.dumps(one))
+    assert one != make(1.2)
+    assert one != 3
+    assert len({one, make(), make(1.2)}) == 2
+    negative = GaussianMixture([1], [[-0.0, 0]], [np.eye(2)])
+    zero = GaussianMixture([1], [[0.0, 0]], [np.eye(2)])
+    assert negative == zero
+    assert hash(negative) == hash(zero)
+
+
+def test_correlations_are_zero_if_not_given():
+    mixture = GaussianMixture.from_stddevs([0.5, 0.5], np.zeros((2, 2)),
+                                           [[1, 2], [2, 1]])
+    assert_array_equal(mixture.rho, 0)
+    alike = GaussianMixture.from_stddevs([0.5, 0.5], np.zeros((2, 2)),
+                                         [[1, 2], [2, 1]], 0.3)
+    assert_allclose(alike.rho, 0.3)

@@ -326,3 +326,25 @@ def test_bad_arguments_are_named():
         [0.5, 0.5, 0.3, -0.3], np.zeros((4, 2)), np.ones((4, 2)), np.zeros(4))
     with pytest.raises(ValueError, match='put negative ones first'):
         MultiGaussianPSFModel(mixture)
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    ('rho_1', 1.5), ('rho_2', -1.0), ('fraction_1', 2.0),
+    ('fraction_1', -0.5), ('x_stddev_1', -1.0), ('y_stddev_2', 0.0)])
+def test_values_that_no_gaussian_has_are_refused(mixture, name, value):
+    model = MultiGaussianPSFModel(mixture)
+    with pytest.raises(ValueError, match=f'{name} must be'):
+        setattr(model, name, value)
+    with pytest.raises(ValueError, match=f'{name} must be'):
+        getattr(model, name).value = value
+
+
+def test_ties_are_part_of_the_derivatives(mixture):
+    start = MultiGaussianPSFModel(mixture, flux=5000, x_0=11,
+                                  y_0=10).free_shape()
+    data = start(X, Y)
+    start.y_stddev_1.tied = lambda model: model.x_stddev_1
+    squares = [np.sum((TRFLSQFitter()(
+        start.copy(), X, Y, data, maxiter=1000, estimate_jacobian=numerical)(
+            X, Y) - data)**2) for numerical in (False, True)]
+    assert squares[0] < 1.01 * squares[1]

@@ -17,6 +17,7 @@ from astropy.nddata import (
 )
 from astropy.table import QTable, Table
 from astropy.utils import minversion
+from astropy.utils.exceptions import AstropyUserWarning
 from astropy.utils.masked import Masked
 from astropy.wcs import WCS
 from numpy.testing import assert_allclose
@@ -43,6 +44,7 @@ from photutils_mgauss import (
     select_psf_stars,
 )
 from photutils_mgauss.fitting import posterior
+from photutils_mgauss.utils.image import read_pixels
 
 SHAPE = (41, 43)
 MIXTURE = GaussianMixture([1], [[0, 0]], [[[1.8, 0.2], [0.2, 1.6]]])
@@ -562,3 +564,30 @@ def test_tables_of_stars_are_read_alike(call, names, kind):
 def test_tables_without_positions_are_refused_alike(call, table, kind, words):
     with pytest.raises(kind, match=words):
         call_with_table(call, table)
+
+
+@pytest.mark.parametrize(('change', 'words'), [
+    ({'data': np.full(SHAPE, np.nan)}, 'data has no pixel.*all are NaN'),
+    ({'mask': np.ones(SHAPE, bool)}, 'no pixel.*all are masked'),
+    ({'error': np.full(SHAPE, np.nan)}, 'no pixel.*error that is not'),
+])
+def test_an_image_without_a_pixel_is_said(change, words):
+    given = {'data': DATA, 'error': ERROR, 'mask': MASK, **change}
+    with pytest.warns(AstropyUserWarning, match=words):
+        read_pixels(**given)
+
+
+@pytest.mark.parametrize('sky', [0.0, 300.0])
+@pytest.mark.parametrize('padding', [0, -32768])
+def test_a_part_without_data_is_said_if_it_is_not_masked(rng, sky, padding):
+    image = sky + rng.normal(0, 17, (120, 130))
+    empty = np.add(*np.indices(image.shape)) < 60
+    image[empty] = padding
+    with pytest.warns(AstropyUserWarning, match=r'11 % of the pixels of data '
+                      rf'have exactly the value {padding}.*give a mask'):
+        read_pixels(image)
+    read_pixels(image, None, empty)
+    read_pixels(image, np.where(empty, 0, 1.0))
+    # One without noise is no mosaic: it is a simulation.
+    read_pixels(MIXTURE.render((200, 220), 90, 100, flux=1e4))
+    read_pixels(np.zeros(SHAPE))
