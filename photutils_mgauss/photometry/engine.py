@@ -222,6 +222,16 @@ class StarGroups:
         return kernels.Stars(self.starts, self.boxes, self.initial, self.sky,
                              self.lower, self.upper)
 
+    @property
+    def take_long(self):
+        """
+        Whether they are more than a chunk, or one group is.
+
+        They are fitted in other threads then: this one has to see an
+        interrupt.
+        """
+        return np.square(np.diff(self.starts), dtype=float).sum() > _CHUNK
+
     def chunks(self):
         """Yield runs of whole groups of about equal cost."""
         sizes = np.diff(self.starts)
@@ -328,8 +338,10 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     chunks = list(stars.chunks())
     watch = partial(tqdm, desc='Fitting stars', total=len(chunks),
                     disable=not progress_bar)
-    pool = (nullcontext(executor) if executor is not None else
-            ThreadPoolExecutor(n_threads or available_cores()))
+    if executor is None and (n_threads or stars.take_long):
+        pool = ThreadPoolExecutor(n_threads or available_cores())
+    else:
+        pool = nullcontext(executor)
     with pool as executor, _interruptible(stop), closing(
             map_parallel(work, chunks, executor=executor)) as fits:
         return Fits.joined(list(watch(fits)))
@@ -337,12 +349,7 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
 
 @contextmanager
 def _interruptible(stop):
-    """
-    Tell the kernels to end if nobody waits for them any more.
-
-    They run in other threads even where there is one chunk only: this one
-    has to see the interrupt.
-    """
+    """Tell the kernels to end if nobody waits for them any more."""
     try:
         yield
     except BaseException:
