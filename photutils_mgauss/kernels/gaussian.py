@@ -77,10 +77,13 @@ def pixel_panels(dy, p, s, q):
     where nothing is there. Beyond the Gaussian itself there are none, however
     small it is.
     """
-    reach = sqrt(LOG_NOTHING / q)
-    low, high = max(dy - 0.5, -reach), min(dy + 0.5, reach)
-    if not low < high:
-        return low, 0.0, 0
+    low, high = dy - 0.5, dy + 0.5
+    far = max(-low, high)
+    if q * far * far > LOG_NOTHING:
+        reach = sqrt(LOG_NOTHING / q)
+        low, high = max(low, -reach), min(high, reach)
+        if not low < high:
+            return low, 0.0, 0
     # At fixed x the Gaussian has the precision q + s^2 p along y. Eight
     # points over two standard deviations leave less than 1e-11 of the peak.
     n = max(1, ceil(0.5 * (high - low) * sqrt(q + s * s * p)))

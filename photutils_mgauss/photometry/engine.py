@@ -221,6 +221,16 @@ class StarGroups:
         return kernels.Stars(self.starts, self.boxes, self.initial, self.sky,
                              self.lower, self.upper)
 
+    @property
+    def take_long(self):
+        """
+        Whether they are more than a chunk, or one group is.
+
+        They are fitted in other threads then: this one has to see an
+        interrupt.
+        """
+        return np.square(np.diff(self.starts), dtype=float).sum() > _CHUNK
+
     def chunks(self):
         """Yield runs of whole groups of about equal cost."""
         sizes = np.diff(self.starts)
@@ -330,18 +340,13 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     pool = (nullcontext(executor) if n_threads is None
             or executor is not None else Threads(n_threads))
     with pool as executor, _interruptible(stop), closing(map_parallel(
-            work, chunks, executor=executor, long=True)) as fits:
+            work, chunks, executor=executor, long=stars.take_long)) as fits:
         return Fits.joined(list(watch(fits)))
 
 
 @contextmanager
 def _interruptible(stop):
-    """
-    Tell the kernels to end if nobody waits for them any more.
-
-    They run in other threads even where there is one chunk only: this one
-    has to see the interrupt.
-    """
+    """Tell the kernels to end if nobody waits for them any more."""
     try:
         yield
     except BaseException:
