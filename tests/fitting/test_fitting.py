@@ -459,3 +459,27 @@ def test_gaussians_are_drawn_as_they_are_defined(tilt, width, mean):
     peak = 1 / (2 * np.pi * 1.3 * width**2)
     assert_allclose(images[0], peak * np.exp(-exponent / 2), rtol=1e-11,
                     atol=1e-100 * peak)
+
+
+@pytest.mark.parametrize('n_components', [1, 3])
+def test_noise_is_no_star(rng, n_components):
+    # The best of all places and shapes is far above a single pixel's noise.
+    fits = fit_mixture(rng.normal(0, 3, (20, 25, 27)), n_components)
+    assert not any(fit.status.usable for fit in fits)
+    assert FitStatus.NO_STAR in {fit.status for fit in fits}
+    with pytest.raises(ValueError, match='cannot be fitted'):
+        fit_mixture(rng.normal(0, 3, (25, 27)), n_components)
+
+
+def test_a_negative_star_is_no_star(rng):
+    noise = rng.normal(0, 1, (20, 31, 33))
+    fits = fit_mixture(noise - image_of(TRUTH, flux=1e4), 2)
+    assert not any(fit.status.usable for fit in fits)
+
+
+def test_a_faint_star_is_one(rng):
+    # Forty standard errors of its flux.
+    image = image_of(TRUTH, flux=150) + rng.normal(0, 1, (31, 33))
+    fit = fit_mixture(image, 1)
+    assert fit.status == FitStatus.CONVERGED
+    assert_allclose(fit.flux, 150, atol=30)
