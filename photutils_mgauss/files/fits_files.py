@@ -268,7 +268,8 @@ def chosen_hdu(hdus, candidates, ext):
         ext = ','.join(map(str, ext))
     name, _, version = str(ext).strip().upper().partition(',')
     found = [one for one in candidates
-             if (str(hdus.index(one)) if name.isdigit() else one.name) == name
+             if (str(hdus.index(one)) if name.isdigit()
+                 else one.name.upper()) == name
              and version in ('', str(one.ver))]
     return found[0] if len(found) == 1 else None
 

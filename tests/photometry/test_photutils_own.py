@@ -27,7 +27,8 @@ globals().update({name: value for name, value in vars(theirs).items()
                   if name.startswith(('test_', 'fixture_', 'Test'))})
 
 pytestmark = pytest.mark.filterwarnings(
-    'ignore:Photutils fits the stars, without compiled code')
+    'ignore:Photutils fits the stars, without compiled code',
+    'ignore:data has no pixel that can be used')
 
 OWN_WORDS = 'the same is refused in words of our own'
 
