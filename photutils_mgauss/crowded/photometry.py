@@ -198,9 +198,9 @@ class CrowdedMixturePhotometry:
     True
     """
 
-    results = PerThread()
+    results = PerThread('The table of the last call.')
     # That of a pixel of the last image.
-    _noise = PerThread()
+    _noise = PerThread('The noise of a pixel of the last image.')
 
     def __init__(self, psf_model, *, threshold=4.5, keep=2.0, depth=3.5,
                  count_slope=1.5, background_size=64, psf_error=0.01,

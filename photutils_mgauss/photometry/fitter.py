@@ -77,7 +77,7 @@ class MixtureFitter:
     """
 
     supported_constraints = ('fixed', 'bounds')
-    fit_info = PerThread()
+    fit_info = PerThread('How the last fit went, a dictionary.')
 
     def __init__(self):
         self.fit_info = {}

@@ -118,11 +118,11 @@ class MixturePSFPhotometry(PSFPhotometry):
     [14.2, 15.7, 500.0]
     """
 
-    data_unit = PerThread()
-    finder_results = PerThread()
-    init_params = PerThread()
-    results = PerThread()
-    _fit_info = PerThread()
+    data_unit = PerThread('The unit of the data of the last call.')
+    finder_results = PerThread('What the finder found in the last call.')
+    init_params = PerThread('Where the fits of the last call started.')
+    results = PerThread('The table of the last call.')
+    _fit_info = PerThread('How the fits of the last call went.')
 
     def __init__(self, psf_model, fit_shape, *, fitter=None, executor=None,
                  n_threads=None, fit_sky=False, effective_gain=None,

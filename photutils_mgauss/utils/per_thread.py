@@ -24,7 +24,15 @@ class PerThread:
     What is set in the usual way is seen by all threads that keep none of
     their own; `keep` is for what comes out of a call. Copies and pickles of
     an object take the last value of any thread.
+
+    Parameters
+    ----------
+    words : str
+        What the attribute is, its docstring.
     """
+
+    def __init__(self, words):
+        self.__doc__ = words
 
     def __set_name__(self, owner, name):
         self._name = name
