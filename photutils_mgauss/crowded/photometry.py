@@ -199,7 +199,6 @@ class CrowdedMixturePhotometry:
     """
 
     results = PerThread('The table of the last call.')
-    # That of a pixel of the last image.
     _noise = PerThread('The noise of a pixel of the last image.')
 
     def __init__(self, psf_model, *, threshold=4.5, keep=2.0, depth=3.5,
