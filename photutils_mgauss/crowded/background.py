@@ -2,7 +2,6 @@
 import numpy as np
 
 from photutils_mgauss import kernels
-from photutils_mgauss.psf.local import cells
 
 # How strongly neighbouring nodes are tied, in units of a node's information.
 _TIE = 1e-3
@@ -10,10 +9,12 @@ _TIE = 1e-3
 
 class Mesh:
     """
-    Nodes of a bilinear background, at multiples of the spacing.
+    Nodes of a bilinear background, near multiples of the spacing.
 
-    A node is the mean of the sky over the pixels nearest to it, so that it
-    depends on nothing further away. Levels are flat, ordered by y, then x.
+    A node is the mean of the sky over the pixels nearest to a multiple, so
+    that it depends on nothing further away, and stands in the middle of
+    them: at the edges of the image, too, a plane is one. Levels are flat,
+    ordered by y, then x.
 
     Parameters
     ----------
@@ -24,17 +25,14 @@ class Mesh:
     """
 
     def __init__(self, shape, origin, spacing):
-        self.y, self.x = (_lattice(first, n, spacing) - first
-                          for first, n in zip(origin, shape, strict=True))
+        (self.y, own_y), (self.x, own_x) = (
+            _nodes(_lattice(first, n, spacing) - first, n)
+            for first, n in zip(origin, shape, strict=True))
         self.shape = self.y.size, self.x.size
-        pixels = [np.arange(float(n)) for n in shape]
+        self._owner = [own_y, own_x]
         self._rows, self._columns = (
-            cells(p, nodes) for p, nodes in zip(pixels, (self.y, self.x),
-                                                strict=True))
-        self._owner = [np.searchsorted((nodes[1:] + nodes[:-1]) / 2, p,
-                                       side='right')
-                       for p, nodes in zip(pixels, (self.y, self.x),
-                                           strict=True)]
+            _between(np.arange(float(n)), nodes)
+            for n, nodes in zip(shape, (self.y, self.x), strict=True))
         self.tie = _TIE * spacing**2
 
     def image(self, level):
@@ -104,12 +102,19 @@ class Mesh:
     def shares(self, x, y):
         """Return the four nodes around positions and their shares (n, 4)."""
         n = self.x.size
-        column, fx = cells(x, self.x)
-        row, fy = cells(y, self.y)
+        column, fx = _between(x, self.x)
+        row, fy = _between(y, self.y)
         node = (row * n + column)[:, None] + np.array([0, 1, n, n + 1])
         share = np.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy,
                           fx * fy], axis=1)
         return node, share
+
+    def owners(self, x, y):
+        """Return the node that has the pixel at each position (n,)."""
+        row, column = (
+            owner[np.clip(np.rint(p).astype(int), 0, owner.size - 1)]
+            for p, owner in zip((y, x), self._owner, strict=True))
+        return row * self.x.size + column
 
 
 def _lattice(first, size, spacing):
@@ -117,3 +122,21 @@ def _lattice(first, size, spacing):
     low = np.floor(first / spacing + 0.5)
     high = max(np.floor((first + size - 1) / spacing + 0.5), low + 1)
     return np.arange(low, high + 1) * float(spacing)
+
+
+def _nodes(multiples, n):
+    """Return nodes, and the one that each of n pixels is nearest to."""
+    owner = np.searchsorted((multiples[1:] + multiples[:-1]) / 2,
+                            np.arange(float(n)), side='right')
+    count = np.bincount(owner, minlength=multiples.size)
+    total = np.bincount(owner, np.arange(n), minlength=multiples.size)
+    # One without pixels stays where it is.
+    return np.divide(total, count, where=count > 0,
+                     out=multiples.copy()), owner
+
+
+def _between(positions, nodes):
+    """Return the node before each position, and how far it is to the next."""
+    i = np.clip(np.searchsorted(nodes, positions, side='right') - 1, 0,
+                nodes.size - 2)
+    return i, (positions - nodes[i]) / (nodes[i + 1] - nodes[i])
