@@ -462,7 +462,9 @@ def _fractions(weights):
 def _check_shape(name, signed, _, value):
     """Raise if the parameter of a shape has a value that no Gaussian has."""
     reason = _fault(name, signed, np.asarray(value, float))
-    if reason:
+    # photutils puts 1 into all parameters, and calls the model, before it has
+    # their values; a correlation of 1 is drawn as the largest valid one.
+    if reason and not np.all(value == 1):
         msg = f'{name} must be {reason}, got {value}'
         raise ValueError(msg)
 

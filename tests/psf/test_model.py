@@ -348,3 +348,10 @@ def test_ties_are_part_of_the_derivatives(mixture):
         start.copy(), X, Y, data, maxiter=1000, estimate_jacobian=numerical)(
             X, Y) - data)**2) for numerical in (False, True)]
     assert squares[0] < 1.01 * squares[1]
+def test_the_one_that_photutils_puts_into_all_parameters_is_taken():
+    model = MultiGaussianPSFModel()
+    for name in model.param_names:
+        setattr(model, name, 1)
+    assert np.isfinite(model(1, 1))
+
+
