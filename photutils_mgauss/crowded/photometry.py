@@ -360,11 +360,15 @@ class CrowdedMixturePhotometry:
         ValueError
             If there is no table yet.
         """
-        if self.results is None:
-            msg = 'decode_flags needs stars: call the object first'
-            raise ValueError(msg)
-        return decode(self.results['flags'],
+        return decode(self._last_table('decode_flags')['flags'],
                       return_bit_values=return_bit_values)
+
+    def _last_table(self, method):
+        """Return the table of the last call, for a method that needs it."""
+        if self.results is None:
+            msg = f'{method} needs stars: call the object first'
+            raise ValueError(msg)
+        return self.results
 
     def make_model_image(self, shape, *, psf_shape=None,
                          include_local_bkg=False):
@@ -390,11 +394,8 @@ class CrowdedMixturePhotometry:
         ValueError
             If there is no table yet.
         """
-        if self.results is None:
-            msg = 'make_model_image needs stars: call the object first'
-            raise ValueError(msg)
+        table = self._last_table('make_model_image')
         shape = as_shape(shape, 'shape')
-        table = self.results
         stars = np.array(positions(table))
         stars[2, (table['flags'] & REPEATED) > 0] = 0
         window = None if psf_shape is None else as_shape(psf_shape,
