@@ -24,7 +24,8 @@ def add(commands):
     """Add the command to the parser's."""
     parser = tools.command(
         commands, 'motions', 'proper motions and corrected WCS',
-        'Match the stars of two or more exposures, align the exposures on '
+        'Match the stars of two or more exposures, or of one and a '
+        'catalogue like that of Gaia, align the exposures on '
         'objects of known motion, and fit proper motions. Inputs are '
         'catalogues, of mgauss photometry or with ra, dec and their errors, '
         'or images, which are measured first. Without references the '
@@ -129,9 +130,10 @@ def _check(options):
         raise ValueError(msg)
     tools.check_different(options.inputs)
     check_observer(options.observer, len(options.inputs))
-    if len(options.inputs) < 2:
+    if len(options.inputs) < 2 and not options.references:
         msg = (f'inputs must be at least 2 exposures, got only '
-               f'{options.inputs[0]}')
+               f'{options.inputs[0]}; one is enough with --references that '
+               'have positions of another time')
         raise ValueError(msg)
     folder = Path(options.output)
     if folder.exists() and not folder.is_dir():

@@ -44,7 +44,8 @@ class ProperMotionFitter:
         ``parallax``, their ``_error`` and ``_corr``, ``ref_epoch``,
         ``radial_velocity``, and ``class``: 'qso' or 'galaxy' (motion and
         parallax zero), 'star', or 'position' (motion unknown; the default
-        for rows without motion). Or identifiers of quasars and galaxies; or
+        for rows without motion). Positions with errors count as another
+        epoch. Or identifiers of quasars and galaxies; or
         the name of a boolean column of the epochs that marks them. None
         makes all motions relative to the mean of the stars.
     ref_epoch : `~astropy.time.Time` or float, optional
@@ -137,7 +138,8 @@ class ProperMotionFitter:
         Parameters
         ----------
         epochs : sequence of `Epoch`
-            At least two, in any order.
+            At least two, in any order; or one, or many of one time, with
+            references that have positions of another time.
 
         Returns
         -------
@@ -146,8 +148,9 @@ class ProperMotionFitter:
         Raises
         ------
         ValueError
-            If the epochs have no time baseline or no stars in common, or
-            an epoch has fewer references than its map needs.
+            If the epochs have no time baseline, with each other or with
+            positions of references, or no stars in common, or an epoch has
+            fewer references than its map needs.
         """
         options = self._options()
         sightings = assemble(epochs, self.references, self._how_to_match(),

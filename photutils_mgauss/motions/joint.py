@@ -114,6 +114,22 @@ def _normal_matrices(columns, weighted, problem):
     return normal
 
 
+def measured_ranks(problem, *, tolerance=1e-9):
+    """
+    Return how many parameters of each star its detections measure, (n,).
+
+    Eigenvalues of the normal matrix, scaled to a unit diagonal, below the
+    ``tolerance`` are none.
+    """
+    columns = problem.columns()
+    weighted = [_weigh(problem.weights, column) for column in columns]
+    normal = np.moveaxis(_normal_matrices(columns, weighted, problem), 2, 0)
+    scale = np.sqrt(np.einsum('nkk->nk', normal))
+    scale = 1 / np.where(scale > 0, scale, np.inf)
+    normal = normal * scale[:, :, None] * scale[:, None, :]
+    return np.sum(np.linalg.eigvalsh(normal) > tolerance, axis=1)
+
+
 def _add_priors(priors, normal, moment):
     if len(priors.stars):
         normal[..., priors.stars] += priors.precision
@@ -418,6 +434,9 @@ def _leak(problem):
     weighted = [_weigh(problem.weights, column) for column in columns]
     normal = _normal_matrices(columns, weighted, problem)
     factor, solved = inverse_factor(normal[:4, :4])
+    if not solved.all():
+        _add_known(problem.priors, normal, solved)
+        factor, solved = inverse_factor(normal[:4, :4])
     inverse = gram(factor)
     leak = apply(inverse, normal[:4, 4])
     corner = normal[4, 4] - np.sum(normal[:4, 4] * leak, axis=0)
@@ -430,3 +449,9 @@ def _leak(problem):
     motion[:, ~solved] = np.nan
     inverse = problem.plane.local_inverse(problem.origin)
     return correlation, np.einsum('ijn,jn->in', inverse, motion)
+
+
+def _add_known(priors, normal, solved):
+    """Add what is known of stars that are not solved without."""
+    which = np.flatnonzero(~solved[priors.stars])
+    normal[:4, :4, priors.stars[which]] += priors.precision[:4, :4, which]

@@ -7,6 +7,7 @@ from scipy.special import chdtri, ndtr
 from photutils_mgauss.motions.frames import Frames, solve_frames
 from photutils_mgauss.motions.joint import (
     Estimates,
+    measured_ranks,
     parallax_leak,
     reduce_all,
     solve_all,
@@ -14,12 +15,14 @@ from photutils_mgauss.motions.joint import (
 )
 from photutils_mgauss.motions.perspective import swerved
 from photutils_mgauss.motions.prepare import Setup, State
+from photutils_mgauss.motions.priors import weak_priors
 from photutils_mgauss.motions.problem import MotionProblem
 from photutils_mgauss.motions.relative import remove_mean_fields
 from photutils_mgauss.motions.stacked import dimensions_2x2, invert_2x2
 
 CONVERGED = 1e-3  # of the median error of a detection
 MAX_ITERATIONS = 40
+WEAK = 1e4  # errors of a detection [per yr]: a prior that says nothing
 SIGNIFICANT = 2.0  # standard deviations that call for a floor
 FEW, MANY = 10, 0.25  # detections of a star, and their part, to be rejected
 
@@ -77,7 +80,9 @@ def finished(setup, state, problem, frames, estimates):
 def pose(setup, state):
     """Return the `MotionProblem` of the present maps, masks and floors."""
     sightings, transform = setup.sightings, setup.transform
-    ties, priors = _ties(setup, state), setup.priors.without(state.dropped)
+    ties = _ties(setup, state)
+    priors = setup.priors.without(state.dropped).with_others(
+        setup.places.of(state.dropped))
     offsets = np.empty_like(sightings.places)
     weights = np.empty_like(sightings.covariance)
     for e, coefficients in enumerate(state.maps):
@@ -265,14 +270,34 @@ def _discrepant(setup, problem, frames):
     bound, free = (
         solve(setup, one, frames, residuals=True).total
         for one in (alone, alone.unbound))
+    open_ = ~np.isfinite(free)
+    tested = alone.ranks
+    if open_.any():
+        free[open_], missing = _barely_known(setup, alone, frames, open_)
+        tested[open_] -= np.minimum(missing, tested[open_])
     rise = bound - free
-    limit = chi2_limit(setup.options.clip, alone.ranks)
+    limit = chi2_limit(setup.options.clip, tested)
     worst = np.nan_to_num(np.divide(rise, limit, where=limit > 0,
                                     out=np.zeros_like(rise)), nan=0.0)
     # A few at a time: one bad reference pulls the frame from the others.
     most = max(1, len(stars) // 20)
     chosen = np.argsort(worst)[::-1][:most]
     return stars[chosen[worst[chosen] > 1]]
+
+
+def _barely_known(setup, problem, frames, which):
+    """
+    Return chi-squares of stars whose detections do not suffice alone.
+
+    They are those of the best parameters of all, which a prior finds that is
+    too weak to count; and the number of parameters left open.
+    """
+    some = problem.unbound.select(np.flatnonzero(which))
+    missing = some.n_parameters - measured_ranks(some)
+    sigma = WEAK * np.sqrt(setup.typical_variance)
+    weak = replace(some, priors=weak_priors(some.n_stars, some.n_parameters,
+                                            sigma))
+    return solve(setup, weak, frames, residuals=True).total, missing
 
 
 def _floors(setup, state, problem, frames, *, robust=False):
