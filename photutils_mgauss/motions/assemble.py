@@ -1,5 +1,6 @@
 """From epochs and references to arrays: matched, and on one plane."""
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from astropy.table import Table
@@ -13,13 +14,18 @@ from photutils_mgauss.motions.baseline import (
     period,
     whole_baseline,
 )
-from photutils_mgauss.motions.epoch import check_epochs, read_epochs
+from photutils_mgauss.motions.epoch import (
+    brightness,
+    check_epochs,
+    read_epochs,
+)
 from photutils_mgauss.motions.matching import (
     Matches,
     find_references,
     match_epochs,
     named_references,
 )
+from photutils_mgauss.motions.orientation import find_maps, find_turns
 from photutils_mgauss.motions.references import (
     Catalogue,
     quasars,
@@ -76,6 +82,8 @@ class Sightings:
         Epochs that have few stars in common with the others, in sentences.
     baseline : float
         Years from the first to the last detection or place of a reference.
+    turns : list of (3, 3) `~numpy.ndarray` or None
+        The rotations of the sphere that corrected pointings.
     """
 
     epochs: list
@@ -98,6 +106,7 @@ class Sightings:
     doubts: tuple
     notes: tuple
     baseline: float
+    turns: list
 
     @property
     def single(self):
@@ -116,12 +125,17 @@ def assemble(epochs, references, how, transform):
     """
     epochs = check_epochs(epochs)
     table = references if isinstance(references, Table) else None
-    detections, plane, unit = read_epochs(epochs, table)
+    turns, turned = [None] * len(epochs), ()
+    if how.by == 'pattern':
+        turns, turned = find_turns(epochs, table)
+    detections, plane, unit = read_epochs(epochs, table, turns=turns)
     catalogue = None if table is None else read_catalogue(table, plane, unit)
     check_baseline(epochs, catalogue)
     on_sky = np.array([epoch.is_sky for epoch in epochs])
-    every, matches, known = match_epochs(detections, on_sky.all(), catalogue,
-                                         how, unit)
+    orient = partial(find_maps, epochs, detections, catalogue,
+                     None if table is None else brightness(table))
+    every, matches, known, mapped = match_epochs(
+        detections, on_sky.all(), catalogue, how, unit, orient)
     years = (every.years[:, 0] if every.years.shape[1] == 1
              else np.nanmean(every.years, axis=1))
     if references is None:
@@ -131,9 +145,9 @@ def assemble(epochs, references, how, transform):
     elif known is None:
         known = find_references(catalogue, every, years, how.tolerance(unit))
     seen = known >= 0
-    stars, notes = known[seen], ()
+    stars, notes = known[seen], (*turned, *mapped)
     if len(epochs) == 1 and len(stars):
-        notes = few_references(every.plane[:, 0], known, catalogue)
+        notes += few_references(every.plane[:, 0], known, catalogue)
     catalogue = (quasars(len(stars)) if catalogue is None
                  else catalogue.select(seen))
     check_common(every.found, stars, catalogue)
@@ -151,7 +165,7 @@ def assemble(epochs, references, how, transform):
                      covariance, every.years, years, tdb(years), observer,
                      every.usable, every.flux, ties, catalogue, stars,
                      velocity, _not_there(references, stars), notes,
-                     whole_baseline(every.years, catalogue))
+                     whole_baseline(every.years, catalogue), turns)
 
 
 def _not_there(references, stars):

@@ -18,7 +18,11 @@ from photutils_mgauss.sky.observers import (
     observer_velocity,
     remove_aberration,
 )
-from photutils_mgauss.sky.tangent_plane import TangentPlane, unit_vectors
+from photutils_mgauss.sky.tangent_plane import (
+    TangentPlane,
+    local_axes,
+    unit_vectors,
+)
 from photutils_mgauss.sky.wcs import (
     check_celestial,
     pixel_jacobian,
@@ -32,6 +36,7 @@ COLUMNS = {
     'x_err': ('x_err', 'x_error'), 'y_err': ('y_err', 'y_error'),
     'ra_err': ('ra_error', 'ra_err'), 'dec_err': ('dec_error', 'dec_err'),
     'flux': ('flux_fit', 'flux'),
+    'magnitude': ('mag', 'phot_g_mean_mag'),
 }
 
 
@@ -285,6 +290,15 @@ def table_vectors(table):
                         np.where(np.abs(dec) <= 90, dec, np.nan))
 
 
+def brightness(table):
+    """Return numbers (n,) that grow with the flux, NaN where unknown."""
+    for key, sign in (('flux', 1), ('magnitude', -1)):
+        values = numbers(table, key)
+        if np.isfinite(values).any():
+            return sign * values
+    return values
+
+
 def pixels(epoch):
     """Return x and y [pix] of an epoch."""
     return numbers(epoch.table, 'x', u.pix), numbers(epoch.table, 'y', u.pix)
@@ -307,7 +321,7 @@ def check_epochs(epochs):
     return epochs
 
 
-def read_epochs(epochs, references=None):
+def read_epochs(epochs, references=None, *, turns=None):
     """
     Return what epochs say, in one plane.
 
@@ -316,6 +330,9 @@ def read_epochs(epochs, references=None):
     epochs : list of `Epoch`
     references : `~astropy.table.Table`, optional
         Reference objects, whose unit counts where nothing is on the sky.
+    turns : list of (3, 3) `~numpy.ndarray` or None, optional
+        Rotations of the sphere that correct pointings, None for those that
+        are right.
 
     Returns
     -------
@@ -326,11 +343,15 @@ def read_epochs(epochs, references=None):
     """
     vectors = [sky_vectors(epoch) if epoch.is_sky else None
                for epoch in epochs]
+    if turns is not None:
+        vectors = [vector if turn is None else turn @ vector
+                   for vector, turn in zip(vectors, turns, strict=True)]
     plane = _common_plane(vectors)
     unit = 'mas' if plane else _common_unit(epochs, references)
     # Popped, so that a million directions are kept no longer than needed.
-    detections = [read_epoch(epoch, plane, vectors.pop(0))
-                  for epoch in epochs]
+    turns = [None] * len(epochs) if turns is None else turns
+    detections = [read_epoch(epoch, plane, vectors.pop(0), turn)
+                  for epoch, turn in zip(epochs, turns, strict=True)]
     return detections, plane, unit
 
 
@@ -360,12 +381,13 @@ def _common_unit(epochs, references):
     return units.pop()
 
 
-def read_epoch(epoch, plane=None, vectors=None):
+def read_epoch(epoch, plane=None, vectors=None, turn=None):
     """
     Return the `Detections` of an epoch.
 
     ``plane`` is the common `TangentPlane`, and ``vectors`` the directions
     already computed; both None where nothing is known about the sky.
+    ``turn`` is the rotation (3, 3) they had, if any.
     """
     years = np.asarray(epoch.years, dtype=float)
     ids, flux = _ids(epoch.table), numbers(epoch.table, 'flux')
@@ -374,7 +396,7 @@ def read_epoch(epoch, plane=None, vectors=None):
         positions, covariance = _read_plane(epoch)
     else:
         positions = plane.project(vectors)
-        covariance = _sky_covariance(epoch, plane, positions)
+        covariance = _sky_covariance(epoch, plane, positions, turn)
     found = np.isfinite(positions).all(axis=0) & np.isfinite(years)
     return Detections(ids, np.where(found, positions, np.nan), covariance,
                       years, flux, velocity, found,
@@ -399,7 +421,7 @@ def _covariance(table, dx, dy, scale=1.0, unit=u.pix**2):
     return np.where(good, np.stack([dx * dx, cross, dy * dy]), np.nan)
 
 
-def _sky_covariance(epoch, plane, positions):
+def _sky_covariance(epoch, plane, positions, turn):
     """Carry the errors of pixels or sky positions to the plane."""
     keys, unit = (('x_err', 'y_err'), u.pix) if epoch.is_pixels else (
         ('ra_err', 'dec_err'), u.mas)
@@ -407,9 +429,14 @@ def _sky_covariance(epoch, plane, positions):
     covariance = _covariance(epoch.table, *errors, unit=unit**2)
     if epoch.is_pixels:
         x, y = pixels(epoch)
-        jacobian = pixel_jacobian(epoch.wcs, plane, x, y)
-    else:
+        jacobian = pixel_jacobian(epoch.wcs, plane, x, y, turn)
+    elif turn is None:
         jacobian = plane.local_jacobian(positions)
+    else:  # The errors are along east and north as the table has them.
+        axes = local_axes(turn.T @ plane.deproject(positions))
+        jacobian = np.stack([plane.displacement(
+            positions, np.tensordot(turn, axis, axes=1)) for axis in axes],
+            axis=1)
     return sandwich_2x2(jacobian, covariance)
 
 

@@ -18,6 +18,7 @@ from photutils_mgauss.sky.transforms import Transform
 from photutils_mgauss.utils.validation import as_choice, as_real
 
 RECIPES = ('joint', 'two-step', 'paper')
+MATCH_BY = ('auto', 'id', 'sky', 'pattern')
 
 
 class ProperMotionFitter:
@@ -56,9 +57,12 @@ class ProperMotionFitter:
         value, or one for each epoch).
     executor : `~concurrent.futures.Executor`, optional
         Where the work is done; the default is threads on all processors.
-    match_by : {'auto', 'id', 'sky'}, optional
+    match_by : {'auto', 'id', 'sky', 'pattern'}, optional
         How epochs are matched. 'auto' uses the column ``id`` if all epochs
-        have one and equal identifiers are at equal places.
+        have one and equal identifiers are at equal places, else positions,
+        as 'sky' does. 'pattern' first finds where each epoch looks by the
+        asterisms of its bright stars: for lists without WCS, and WCS with a
+        pointing off by up to the field of view or a wrong roll.
     match_radius : `~astropy.units.Quantity`, optional
         Largest distance of a match. The default follows from the errors
         and ``max_motion``.
@@ -167,7 +171,7 @@ class ProperMotionFitter:
                        'ref_epoch')
 
     def _how_to_match(self):
-        as_choice(self.match_by, 'match_by', ('auto', 'id', 'sky'))
+        as_choice(self.match_by, 'match_by', MATCH_BY)
         _check_quantity(self.max_motion, 'max_motion', u.mas / u.yr)
         if self.match_radius is not None:
             _check_quantity(self.match_radius, 'match_radius', u.mas, u.pix)

@@ -3,11 +3,12 @@ Which rows of several exposures are the same star.
 
 Rows are matched by an identifier, or by position (``pairing``).
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import astropy.units as u
 import numpy as np
 
+from photutils_mgauss.motions.baseline import COMMON
 from photutils_mgauss.motions.epoch import Detections
 from photutils_mgauss.motions.pairing import (
     Known,
@@ -69,7 +70,7 @@ class HowToMatch:
                          pointing)
 
 
-def match_epochs(detections, on_sky, catalogue, how, unit):
+def match_epochs(detections, on_sky, catalogue, how, unit, orient):
     """
     Match epochs by identifier or position, as their user wants it.
 
@@ -82,6 +83,9 @@ def match_epochs(detections, on_sky, catalogue, how, unit):
         Reference objects, matched along by position.
     how : `HowToMatch`
     unit : {'mas', 'pix'}
+    orient : callable
+        Returns the maps onto the common plane of epochs without a sky, by
+        the pattern of their stars, and sentences on them.
 
     Returns
     -------
@@ -92,14 +96,17 @@ def match_epochs(detections, on_sky, catalogue, how, unit):
     known : (k,) int `~numpy.ndarray` or None
         The star of each object of the catalogue, -1 where it is in no
         epoch; None where it has no positions or is not matched by them.
+    notes : tuple of str
+        How epochs without a sky were found to be turned.
     """
     if _is_by_id(detections, on_sky, how, unit):
         matches, names = match_ids([one.ids for one in detections])
-        known = None
-    else:
-        matches, names, known = _match_on_plane(detections, catalogue,
-                                                how.tolerance(unit))
-    return _stack(matches, names, detections), matches, known
+        return _stack(matches, names, detections), matches, None, ()
+    known = _known_places(detections, catalogue)
+    matches, notes = _match_on_plane(detections, on_sky, known, how, unit,
+                                     orient)
+    matches, names, known = _named(matches, detections, catalogue, known)
+    return _stack(matches, names, detections), matches, known, notes
 
 
 def _stack(matches, names, detections):
@@ -177,24 +184,76 @@ def _without_offsets(places):
     return places
 
 
-def _match_on_plane(detections, catalogue, tolerance):
-    """
-    Return matches by position, names, and the stars of the catalogue.
+def _known_places(detections, catalogue):
+    """Return the `Known` stars, None for a catalogue without positions."""
+    if catalogue is None or not np.isfinite(catalogue.values[:2]).any():
+        return None
+    return _known(catalogue, float(np.nanmean(detections[0].years)))
 
-    The last is None for a catalogue without positions; its objects that no
-    epoch has seen are not among the stars.
+
+def _match_on_plane(detections, on_sky, known, how, unit, orient):
     """
+    Return matches by position, and sentences on what that took.
+
+    Planes without a sky may be turned, and are if it makes more matches.
+    """
+    tolerance = how.tolerance(unit)
+    if how.by == 'pattern' and not on_sky:
+        maps, notes = orient()
+        return _match_turned(detections, known, tolerance, maps), notes
+    matches = _match_turned(detections, known, tolerance,
+                            [None] * len(detections))
+    if on_sky or not _are_few(matches, known):
+        return matches, ()
+    try:
+        maps, notes = orient()
+    except ValueError:  # No pattern: they stay as they are, and that is said.
+        return matches, ()
+    turned = _match_turned(detections, known, tolerance, maps)
+    if _common(turned, known).sum() <= _common(matches, known).sum():
+        return matches, ()
+    return turned, notes
+
+
+def _common(matches, known):
+    """Return how many stars (E,) of each epoch are known from elsewhere."""
+    seen = matches.seen
+    count = seen.sum(axis=0)
+    if known is not None:
+        count[:known.position.shape[1]] += 1
+    return (seen & (count > 1)).sum(axis=1)
+
+
+def _are_few(matches, known):
+    """Return whether most stars of some epoch are nowhere else."""
+    return (_common(matches, known) < COMMON * matches.seen.sum(axis=1)).any()
+
+
+def _match_turned(detections, known, tolerance, maps):
+    """Return matches by position of planes that maps bring together."""
     years = [float(np.nanmean(one.years)) for one in detections]
-    sigmas = []
-    for one in detections:
+    places, sigmas, reach = [], [], 0.0
+    for one, found in zip(detections, maps, strict=True):
         with np.errstate(invalid='ignore'):
-            sigmas.append(np.sqrt((one.covariance[0]
-                                   + one.covariance[2]) / 2))
-    known = None
-    if catalogue is not None and np.isfinite(catalogue.values[:2]).any():
-        known = _known(catalogue, years[0])
-    matches = match_positions([one.plane for one in detections], sigmas,
-                              years, tolerance, known)
+            sigma = np.sqrt((one.covariance[0] + one.covariance[2]) / 2)
+        if found is not None:
+            sigma *= np.sqrt(abs(np.linalg.det(found.matrix[:, 1:])))
+            reach = max(reach, found.reach)
+        places.append(one.plane if found is None else found.apply(one.plane))
+        sigmas.append(sigma)
+    if reach and tolerance.radius is None and tolerance.max_motion == 0:
+        # Pixels, whose motions nobody knows a limit of.
+        tolerance = replace(tolerance, radius=reach)
+    return match_positions(places, sigmas, years, tolerance, known)
+
+
+def _named(matches, detections, catalogue, known):
+    """
+    Return the matches of stars in some epoch, their names, and which is which.
+
+    The last are the stars (k,) that the objects of the catalogue are, None
+    for one without positions.
+    """
     n_known = 0 if known is None else known.position.shape[1]
     seen = matches.seen.any(axis=0)
     number = np.where(seen, np.cumsum(seen) - 1, -1)

@@ -155,7 +155,8 @@ def bench_one_epoch(n_fields=10):
         away.append(some[1])
     for bright, pulls_ in found.items():
         pull, word = np.hstack(pulls_), 'with' if bright else 'without'
-        line(f'  {word} a motion in the catalogue ({pull.size})', '0.95-1.05', f'{rms(pull):.3f}')
+        line(f'  {word} a motion in the catalogue ({pull.size})',
+             '0.95-1.05', f'{rms(pull):.3f}')
     line('  error over that of two epochs (least, most)', '1',
          f'{np.min(ratio):.6f} {np.max(ratio):.6f}')
     line('  largest difference of a motion, in its errors', '0',
