@@ -83,6 +83,11 @@ def _add_solution(parser):
     group.add_argument('--match-radius', type=tools.positive, metavar='MAS',
                        help='largest distance of a match (default: from the '
                             'errors)')
+    group.add_argument('--match-by', choices=('auto', 'id', 'sky',
+                                              'pattern'), default='auto',
+                       help='pattern finds wrong pointings, rolls and lists '
+                            'that are turned or mirrored '
+                            '(default: %(default)s)')
     group.add_argument('--good-flags', type=tools.not_negative,
                        default=0, metavar='BITS', help='sum of the flags of '
                        'detections to be used all the same')
@@ -326,7 +331,8 @@ def _fitter(options):
     return ProperMotionFitter(
         transform=None if transform == 'none' else transform,
         recipe=options.recipe, parallax=alone or options.parallax,
-        references=_references(options), match_by='id' if alone else 'auto',
+        references=_references(options),
+        match_by='id' if alone else options.match_by,
         systematic='fit' if systematic is None else systematic * u.mas,
         max_motion=options.max_motion * u.mas / u.yr,
         match_radius=None if radius is None else radius * u.mas)

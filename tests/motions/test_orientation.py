@@ -81,13 +81,14 @@ def test_pointings_and_rolls_are_found(rng, pair):
     turned = [note for note in solution.notes if 'pointing' in note]
     assert len(turned) == 2
     assert 'roll by' in turned[0]
-    # The WCS that come back are right everywhere, the corners included.
+    # The WCS that come back are right everywhere, the corners included, up
+    # to what the first pointing, which is right, is of the mean frame.
     true = pair(0, 0, 0)[0]
     corners = [100, 1500, 100, 1500.0], [100, 100, 1500, 1500.0]
     right = true.pixel_to_world(*corners)
     for epoch in solution.epochs:
         assert (epoch.wcs.pixel_to_world(*corners).separation(right)
-                < 10 * u.mas).all()
+                < 50 * u.mas).all()
     assert (solution.alignment['wcs_residual'] < 0.01 * u.mas).all()
 
 
@@ -136,7 +137,7 @@ def same(x, y):
 
 
 def test_lists_in_pixels_of_any_scale_are_matched(rng):
-    epochs, motion = pixel_lists(rng, (
+    epochs, _ = pixel_lists(rng, (
         same, lambda x, y: (900 - 0.5 * y, 0.5 * x),
         lambda x, y: (2 * x + 30, 4000 - 2 * y)))
     solution = ProperMotionFitter(match_by='pattern').fit(epochs)
