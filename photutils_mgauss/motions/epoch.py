@@ -19,6 +19,7 @@ from photutils_mgauss.sky.observers import (
     remove_aberration,
 )
 from photutils_mgauss.sky.tangent_plane import (
+    MAS,
     TangentPlane,
     local_axes,
     unit_vectors,
@@ -37,7 +38,11 @@ COLUMNS = {
     'ra_err': ('ra_error', 'ra_err'), 'dec_err': ('dec_error', 'dec_err'),
     'flux': ('flux_fit', 'flux'),
     'magnitude': ('mag', 'phot_g_mean_mag'),
+    'along_err': ('along_error', 'along_err'),
 }
+# What is not measured across a scan, in errors along it: far beyond what
+# counts as a measurement, near enough that covariances can be inverted.
+ACROSS = 1e5
 
 
 def names_of(key):
@@ -60,7 +65,11 @@ class Epoch:
           optionally the covariance ``xy_cov`` [pix^2]; or
         * ICRS positions: ``ra``, ``dec`` [deg], ``ra_error``, ``dec_error``
           [mas], the first with the cosine of the declination in it, as in
-          the Gaia catalogue (``ra_err`` and ``dec_err`` will do).
+          the Gaia catalogue (``ra_err`` and ``dec_err`` will do); or
+        * scans that measure one direction: ``along`` [mas], the place along
+          the scan from ``ra``, ``dec``, its error ``along_error``, and
+          ``scan_angle`` [deg], the direction of the scan from north through
+          east. Each is one measurement.
 
         Optional columns: ``id`` (any type, unique), ``flux_fit``,
         ``radial_velocity`` [km/s], and ``time``, the time of each row.
@@ -112,7 +121,7 @@ class Epoch:
         if self.wcs is not None:
             check_celestial(self.wcs)
         _check_observer(self.observer)
-        _check_columns(self.table, self.is_pixels)
+        _check_columns(self.table, self.is_pixels, self.is_scan)
         _check_scale(self)
         _check_time(self)
 
@@ -129,6 +138,11 @@ class Epoch:
         has_xy = find_column(self.table, names_of('x')) is not None
         has_sky = 'ra' in self.table.colnames
         return has_xy and (self.wcs is not None or not has_sky)
+
+    @property
+    def is_scan(self):
+        """Whether positions are measured in one direction each."""
+        return 'along' in self.table.colnames and not self.is_pixels
 
     @property
     def is_sky(self):
@@ -187,9 +201,12 @@ def _check_observer(observer):
     _known_observer(observer)
 
 
-def _check_columns(table, is_pixels):
-    wanted = (('x', 'y', 'x_err', 'y_err') if is_pixels
-              else ('ra', 'dec', 'ra_err', 'dec_err'))
+def _check_columns(table, is_pixels, is_scan):
+    wanted = ('ra', 'dec', 'ra_err', 'dec_err')
+    if is_pixels:
+        wanted = ('x', 'y', 'x_err', 'y_err')
+    elif is_scan:
+        wanted = ('ra', 'dec', 'along', 'along_err', 'scan_angle')
     for key in wanted:
         names = names_of(key)
         if find_column(table, names) is None:
@@ -277,10 +294,38 @@ def sky_vectors(epoch):
         vectors = pixel_to_vectors(epoch.wcs, x, y)
     else:
         vectors = table_vectors(epoch.table)
+    if epoch.is_scan:
+        vectors = _along_the_scan(epoch.table, vectors)
     velocity = observer_velocity(epoch.observer)
     if velocity is None:
         return vectors
     return remove_aberration(vectors, velocity)
+
+
+def _along_the_scan(table, vectors):
+    """Return directions (3, n) moved along the scans by what was measured."""
+    east, north = local_axes(vectors)
+    sine, cosine = _scan_directions(table)
+    step = numbers(table, 'along', u.mas) / MAS
+    moved = vectors + step * (sine * east + cosine * north)
+    return moved / np.sqrt(1 + step**2)
+
+
+def _scan_directions(table):
+    angle = np.radians(numbers(table, 'scan_angle', u.deg))
+    return np.sin(angle), np.cos(angle)
+
+
+def _scan_covariance(table):
+    """Return xx, xy, yy of scans, which say nothing across their way."""
+    error = numbers(table, 'along_err', u.mas)
+    sine, cosine = _scan_directions(table)
+    across = (ACROSS * error)**2
+    along = error**2 - across
+    covariance = np.stack([across + along * sine**2, along * sine * cosine,
+                           across + along * cosine**2])
+    return np.where((error > 0) & np.isfinite(error + sine), covariance,
+                    np.nan)
 
 
 def table_vectors(table):
@@ -425,8 +470,11 @@ def _sky_covariance(epoch, plane, positions, turn):
     """Carry the errors of pixels or sky positions to the plane."""
     keys, unit = (('x_err', 'y_err'), u.pix) if epoch.is_pixels else (
         ('ra_err', 'dec_err'), u.mas)
-    errors = (numbers(epoch.table, key, unit) for key in keys)
-    covariance = _covariance(epoch.table, *errors, unit=unit**2)
+    if epoch.is_scan:
+        covariance = _scan_covariance(epoch.table)
+    else:
+        errors = (numbers(epoch.table, key, unit) for key in keys)
+        covariance = _covariance(epoch.table, *errors, unit=unit**2)
     if epoch.is_pixels:
         x, y = pixels(epoch)
         jacobian = pixel_jacobian(epoch.wcs, plane, x, y, turn)

@@ -42,6 +42,7 @@ from photutils_mgauss.motions.stacked import (
     Summed,
     apply,
     apply_transposed,
+    dimensions_2x2,
     gram,
     inverse_factor,
     invert_2x2,
@@ -281,7 +282,8 @@ def _judge(residuals, predicted, weights):
         a, b, c = invert_2x2(*left)
         chi2 = a * x * x + 2 * b * x * y + c * y * y
     return tuple(np.where(good, values, np.nan) for good, values in (
-        (sound, chi2), (used, raw), (used, 2 - leverage)))
+        (sound, chi2), (used, raw),
+        (used, dimensions_2x2(weights) - leverage)))
 
 
 def _times(column, value):

@@ -16,6 +16,7 @@ from photutils_mgauss.motions.pairing import (
     Tolerance,
     match_positions,
 )
+from photutils_mgauss.motions.stacked import variance_2x2
 from photutils_mgauss.sky.space_motion import NO_ERROR
 
 POINTING = 2000.0  # mas: offsets of exposures that are looked for
@@ -234,8 +235,7 @@ def _match_turned(detections, known, tolerance, maps):
     years = [float(np.nanmean(one.years)) for one in detections]
     places, sigmas, reach = [], [], 0.0
     for one, found in zip(detections, maps, strict=True):
-        with np.errstate(invalid='ignore'):
-            sigma = np.sqrt((one.covariance[0] + one.covariance[2]) / 2)
+        sigma = np.sqrt(variance_2x2(one.covariance))
         if found is not None:
             sigma *= np.sqrt(abs(np.linalg.det(found.matrix[:, 1:])))
             reach = max(reach, found.reach)
@@ -315,7 +315,7 @@ def find_references(catalogue, detections, years, tolerance):
     for e, year in enumerate(years):
         # Epoch by epoch: frames that differ would blur a star's mean place.
         known = _known(catalogue, year)
-        sigma = np.sqrt(detections.covariance[[0, 2], e].mean(axis=0))
+        sigma = np.sqrt(variance_2x2(detections.covariance[:, e]))
         matches = match_positions([detections.plane[:, e]], [sigma], [year],
                                   tolerance, known)
         stars = matches.rows[0, :len(found)]

@@ -11,6 +11,7 @@ from photutils_mgauss.motions.priors import (
     add_parallax_prior,
     build_priors,
 )
+from photutils_mgauss.motions.stacked import variance_2x2
 from photutils_mgauss.sky.transforms import Transform
 
 
@@ -146,7 +147,7 @@ def prepare(sightings, options):
     if options.parallax == 'prior':
         priors = add_parallax_prior(priors, len(anchors),
                                     options.parallax_prior)
-    variance = sightings.covariance[0][sightings.usable]
+    variance = variance_2x2(sightings.covariance[:, sightings.usable])
     maps = np.repeat(transform.identity()[None], len(dt), axis=0)
     return (Setup(sightings, options, transform, origin, working, dt, priors,
                   places, anchors, held, relative, drift, nearing, notes,
