@@ -1,7 +1,11 @@
 """What all fields have in common, and the tables they report."""
+import warnings
+
 import numpy as np
 from astropy.stats import gaussian_sigma_to_fwhm
 from astropy.table import QTable
+from astropy.utils.exceptions import AstropyUserWarning
+from scipy.optimize import brentq
 
 from photutils_mgauss.field.normal import model_stamps, to_vector
 from photutils_mgauss.psf.shapes import adaptive_moments
@@ -10,6 +14,9 @@ from photutils_mgauss.utils.image import with_unit
 from photutils_mgauss.utils.star_columns import words_column
 from photutils_mgauss.utils.validation import as_real
 
+# The radius with half of the light of a Gaussian [standard deviations].
+_HALF_LIGHT = np.sqrt(2 * np.log(2))
+
 
 class Field(ComparedByValue):
     """A PSF that varies over a detector; ``mixture_at`` gives it."""
@@ -17,8 +24,10 @@ class Field(ComparedByValue):
     def _described(self, details=''):
         """Return the text of ``repr``; details stand before the degree."""
         used = int(np.count_nonzero(self.stars['used']))
+        pixel = ', pixel_integrated=True' if self.pixel_integrated else ''
         return (f'<{type(self).__name__}({details}degree={self.degree}, '
-                f'shape={self.shape}, {used} of {len(self.stars)} stars)>')
+                f'shape={self.shape}, {used} of {len(self.stars)} stars'
+                f'{pixel})>')
 
     @property
     def centre(self):
@@ -156,6 +165,26 @@ def _own_numbers(fit, centre_stddev):
 
 
 def core_width(mixture):
-    """Return the full width at half maximum of a mixture's core [pix]."""
-    size = np.sqrt(adaptive_moments(mixture).r2 / 2)
+    """
+    Return the full width at half maximum of a mixture's core [pix].
+
+    That of its adaptive moments or, where a core has none, of the Gaussian
+    with half of its light inside the same circle.
+    """
+    shapes = adaptive_moments(mixture)
+    size = np.sqrt(shapes.r2 / 2)
+    if not np.isfinite(size):
+        warnings.warn(
+            'the core of the PSF in the middle of the detector has no size '
+            f'({shapes.message}): the weight under which it is centred is as '
+            'large as the circle with half of the light', AstropyUserWarning,
+            stacklevel=4)
+        size = _half_light_radius(mixture) / _HALF_LIGHT
     return float(size * gaussian_sigma_to_fwhm)
+
+
+def _half_light_radius(mixture):
+    """Return the radius of the circle with half of the light [pix]."""
+    longest = np.sqrt(np.trace(mixture.covariances, axis1=1, axis2=2))
+    far = np.hypot(*mixture.means.T).max() + 5 * longest.max()
+    return brentq(lambda r: mixture.encircled_energy(r) - 0.5, 0, far)

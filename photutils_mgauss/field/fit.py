@@ -21,6 +21,7 @@ from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.input import possible_degree, read_sample
 from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.field.normal import Workers
+from photutils_mgauss.field.pixel import chosen_pixel, warn_of_phase
 from photutils_mgauss.field.tuned_field import TunedMixtureField, known_shapes
 from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 
@@ -33,7 +34,8 @@ _DEGREE, _TUNED_DEGREE = 4, 1
 def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
                       degree=None, radius=10, local_bkg=False,
                       effective_gain=None, reject=True, regularization=1.0,
-                      start=None, centre='core', executor=None):
+                      start=None, centre='core', pixel_integrated='auto',
+                      executor=None):
     """
     Fit a PSF field to the pixels of stars.
 
@@ -101,6 +103,14 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
         full width at half maximum in the middle of the detector; or the flux
         centroid, which wanders from image to image with the noise of the
         wings. With ``start`` it stays where that of ``start`` is.
+    pixel_integrated : 'auto' or bool, optional
+        Whether the Gaussians are those of the optics, integrated over each
+        pixel, or those of the PSF in pixels, sampled at the middle of each.
+        Sampled ones are quicker; integrated ones are needed where the pixels
+        are too coarse. By default the stars decide: PSFs narrower than 1.6
+        pixels, full width at half maximum in the pixels, are integrated.
+        With ``start`` it is as in ``start``, whose optics can be sampled but
+        not the reverse.
     executor : `~concurrent.futures.Executor`, optional
         Where stars are worked on; by default a pool of threads.
 
@@ -136,14 +146,18 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
     options = {'strength': as_real(regularization, 'regularization', above=0),
                'reject': reject}
     as_choice(centre, 'centre', ('core', 'flux'))
+    pixel_integrated = _pixel_integrated(pixel_integrated, start)
     sample = read_sample(data, stars, error, mask, radius, effective_gain)
     top = possible_degree(degree, len(sample.row))
     problem = sample.problem(top, local_bkg)
     with Workers(executor) as workers:
         if start is not None:
+            problem.pixel_integrated = pixel_integrated
             fit = stages.tune(_known(problem, sample, start), top, workers,
                               **options)
             return _tuned(fit, sample, start, radius, centre)
+        problem.pixel_integrated = chosen_pixel(
+            problem, pixel_integrated, options['strength'], workers)
         fit, choice = _free(problem, n_components, degree, top, workers,
                             options)
     return _result(fit, sample, radius, choice, centre)
@@ -166,23 +180,41 @@ def _number(value, name, minimum):
     return as_integer(value, name, minimum=minimum)
 
 
+def _pixel_integrated(value, start):
+    """Return whether to integrate over pixels, or 'auto'."""
+    if not isinstance(value, (bool, np.bool_)) and value != 'auto':
+        msg = f"pixel_integrated must be 'auto', True or False, got {value!r}"
+        raise ValueError(msg)
+    if start is None:
+        return value if isinstance(value, str) else bool(value)
+    known = bool(getattr(start, 'pixel_integrated', False))
+    if value is True and not known:
+        msg = ('pixel_integrated must not be True where start is sampled: its '
+               "mixtures contain the pixel already; leave it at 'auto'")
+        raise ValueError(msg)
+    return known if isinstance(value, str) else bool(value)
+
+
 def _known(problem, sample, start):
     """Return the problem of the changes of a known PSF."""
     if not callable(getattr(start, 'mixture_at', None)):
         msg = (f'start must have a method mixture_at, as GriddedMixturePSF '
                f'has, got {type(start).__name__}')
         raise TypeError(msg)
-    local = known_shapes(start, *sample.expected())
+    local = known_shapes(start, *sample.expected(),
+                         problem.pixel_integrated)
     return replace(problem, form=TunedShapes(), local=local)
 
 
 def _tuned(fit, sample, start, radius, centre):
     sample = sample.without_deviant(fit.problem.used)
-    stddev = _centre_stddev(start.mixture_at(*_middle(sample)), centre)
+    stddev = _centre_stddev(start.mixture_at(*_middle(sample)), centre,
+                            bool(getattr(start, 'pixel_integrated', False)))
+    integrated = fit.problem.pixel_integrated
     return TunedMixtureField(
         start, fit.coefficients, sample.shape, radius, covariance_of(fit),
         star_table(fit, sample, stddev), residual_stars(fit), fit.accuracy,
-        sample.dropped(), stddev)
+        sample.dropped(), stddev, integrated)
 
 
 def _result(fit, sample, radius, choice, centre):
@@ -190,8 +222,12 @@ def _result(fit, sample, radius, choice, centre):
     field = MixtureField(
         fit.coefficients, sample.shape, radius, covariance_of(fit), None,
         residual_stars(fit), fit.accuracy, sample.dropped(), choice,
-        _exposure_table(fit, len(sample.reasons)))
-    stddev = _centre_stddev(field.mixture_at(*_middle(sample)), centre)
+        _exposure_table(fit, len(sample.reasons)),
+        pixel_integrated=fit.problem.pixel_integrated)
+    middle = field.mixture_at(*_middle(sample))
+    if not field.pixel_integrated:
+        warn_of_phase(middle)
+    stddev = _centre_stddev(middle, centre, field.pixel_integrated)
     return replace(field, stars=star_table(fit, sample, stddev),
                    centre_stddev=stddev)
 
@@ -201,9 +237,13 @@ def _middle(sample):
     return [(n - 1) / 2 for n in sample.shape[::-1]]
 
 
-def _centre_stddev(mixture, centre):
+def _centre_stddev(mixture, centre, integrated):
     """Return the size of the weight under which a PSF is centred."""
-    return core_width(mixture) if centre == 'core' else np.inf
+    if centre == 'flux':
+        return np.inf
+    if integrated:
+        mixture = mixture.convolve(stages.PIXEL_VARIANCE * np.eye(2))
+    return core_width(mixture)
 
 
 def _exposure_table(fit, n):

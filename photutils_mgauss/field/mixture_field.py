@@ -82,6 +82,9 @@ class MixtureField(Field):
         The size w of the Gaussian weight under which the PSF's first moment
         about its origin vanishes [pix]; infinite, the default, where the
         origin is the flux centroid.
+    pixel_integrated : bool, optional
+        Whether the mixtures are those of the optics, to be integrated over
+        pixels. By default they contain the pixel and are sampled.
 
     Examples
     --------
@@ -114,6 +117,7 @@ class MixtureField(Field):
     choice: QTable = field(default=None)
     exposures: QTable = field(default=None)
     centre_stddev: float = np.inf
+    pixel_integrated: bool = False
 
     def __repr__(self):
         return self._described(f'n_components={self.n_components}, ')
@@ -128,7 +132,8 @@ class MixtureField(Field):
         tables = {'detector': {'ny': [ny], 'nx': [nx],
                              'radius': [float(self.radius)],
                              'accuracy': [float(self.accuracy)],
-                             'centre_stddev': [float(self.centre_stddev)]},
+                             'centre_stddev': [float(self.centre_stddev)],
+                             'pixel_integrated': [self.pixel_integrated]},
                 'terms': {'coefficient': self.coefficients},
                 'errors': {'covariance': self.covariance},
                 'stars': stars, 'dropped': table_columns(dropped)}
@@ -145,14 +150,16 @@ class MixtureField(Field):
         residual = stars.pop('residual', None)
         exposures = (QTable(tables['exposures']) if 'exposures' in tables
                      else None)
-        # Files once held no centre other than that of the flux.
+        # Files once held no PSF of optics, and no centre other than that of
+        # the flux.
+        integrated = bool(detector.get('pixel_integrated', [False])[0])
         stddev = float(detector.get('centre_stddev', [np.inf])[0])
         return cls(coefficients.reshape(n_terms, -1, 6),
                    (int(detector['ny'][0]), int(detector['nx'][0])),
                    float(detector['radius'][0]), covariance.reshape(n, n),
                    QTable(stars), residual, float(detector['accuracy'][0]),
                    QTable(tables['dropped']), exposures=exposures,
-                   centre_stddev=stddev)
+                   centre_stddev=stddev, pixel_integrated=integrated)
 
     @property
     def n_components(self):
@@ -173,7 +180,8 @@ class MixtureField(Field):
         Returns
         -------
         GaussianMixture
-            Of K Gaussians, its centre at the origin. It contains the pixel.
+            Of K Gaussians, its centre at the origin. It contains the pixel,
+            unless the field is ``pixel_integrated``.
 
         Raises
         ------
@@ -227,4 +235,5 @@ class MixtureField(Field):
         arrays = self._mixtures(x, y, exposure)[:3]
         mixtures = [GaussianMixture(*one) for one in zip(*arrays,
                                                          strict=True)]
-        return GriddedMixturePSF(mixtures, np.column_stack([x, y]))
+        return GriddedMixturePSF(mixtures, np.column_stack([x, y]),
+                                 pixel_integrated=self.pixel_integrated)

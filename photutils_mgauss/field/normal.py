@@ -68,6 +68,8 @@ class FieldProblem:
         What the polynomials mean.
     local : (n, ...) `~numpy.ndarray`
         What the form needs to know of each star.
+    pixel_integrated : bool
+        Whether the shapes are integrated over pixels, not sampled.
     """
 
     stamps: object
@@ -83,6 +85,7 @@ class FieldProblem:
     exposure: np.ndarray
     form: object
     local: np.ndarray
+    pixel_integrated: bool = False
 
     def subset(self, index):
         """Return the problem of some of the stars; nothing is shared."""
@@ -149,7 +152,8 @@ class Workers:
 def equations(problem, coefficients, workers):
     """Form the normal equations at the coefficients."""
     parts = workers.map(
-        _PartEquations(coefficients, problem.fit_sky, problem.form),
+        _PartEquations(coefficients, problem.fit_sky, problem.form,
+                       problem.pixel_integrated),
         len(problem.basis), problem.stamps.data, problem.weights,
         problem.stamps.corners, problem.basis, problem.local,
         problem.sources, problem.anchors, problem.hold, problem.n_sources,
@@ -169,6 +173,7 @@ class _PartEquations:
     coefficients: np.ndarray
     fit_sky: bool
     form: object
+    integrated: bool
 
     def __call__(self, data, weights, corners, basis, local, sources,
                  anchors, hold, n_sources, sky, used):
@@ -186,7 +191,8 @@ class _PartEquations:
                 sky, used)))
             kernels.field_normal(
                 stars, kernels.FieldShapes(basis[part], rows,
-                                           self.form.jacobians(*now)),
+                                           self.form.jacobians(*now),
+                                           self.integrated),
                 self.fit_sky, _SETTLE_STEPS, np.empty((n, n)),
                 kernels.FieldSums(total, right, chi2[part]))
         return Equations(total, right, chi2, sources, sky)
@@ -197,7 +203,8 @@ def model_stamps(problem, coefficients):
     out = np.empty_like(problem.stamps.data)
     rows = kernel_rows_of_logs(*problem.form.shapes(
         coefficients, problem.basis, problem.local))
-    kernels.field_model(problem.stamps.corners, rows, problem.sources,
+    kernels.field_model(problem.stamps.corners, rows,
+                        problem.pixel_integrated, problem.sources,
                         problem.n_sources, problem.sky, out)
     return out
 

@@ -32,6 +32,8 @@ _STAR_EXCESS = 0.3
 _MAX_DEVIANT_PIXELS = 0.1
 # How often the prior takes the widths of the coefficients found under it.
 _ADAPTATIONS = 3
+# Of a unit pixel along either axis [pix^2].
+PIXEL_VARIANCE = 1 / 12
 # Relative error of the PSF assumed before anything is known of it.
 _FIRST_ACCURACY = 0.1
 
@@ -92,7 +94,11 @@ def polynomials(u, v, degree):
 
 
 def first_width(problem):
-    """Estimate the standard deviation of the PSF from the stacked stars."""
+    """
+    Estimate the standard deviation of the PSF from the stacked stars.
+
+    That of the PSF in pixels, or of the optics where these are fitted.
+    """
     data, good = problem.stamps.data, problem.stamps.good
     inner = problem.stamps.offsets() <= 2.5
     light = np.where(good, data, 0)[:, inner].sum(axis=1)
@@ -107,7 +113,9 @@ def first_width(problem):
     growth = np.cumsum(stack.ravel()[order])
     half = radius[np.argmax(growth >= 0.5 * growth.max())]
     # Half the light of a Gaussian is inside 1.18 standard deviations.
-    return max(half, 0.7) / 1.18
+    width = max(half, 0.7) / 1.18
+    return (np.sqrt(width**2 - PIXEL_VARIANCE) if problem.pixel_integrated
+            else width)
 
 
 def ladder(n_components, width):

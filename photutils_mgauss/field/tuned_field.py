@@ -30,9 +30,6 @@ from photutils_mgauss.utils.validation import as_real, as_shape
 
 __all__ = ['TunedMixtureField']
 
-# Of a unit pixel along either axis [pix^2].
-_PIXEL_VARIANCE = 1 / 12
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TunedMixtureField(Field):
@@ -55,7 +52,7 @@ class TunedMixtureField(Field):
         As in `MixtureField`.
     covariance : (6 T, 6 T) `~numpy.ndarray`
         Of the coefficients, change by change and term by term within one.
-    centre_stddev
+    centre_stddev, pixel_integrated
         As in `MixtureField`.
 
     Examples
@@ -87,6 +84,7 @@ class TunedMixtureField(Field):
     accuracy: float = 0.0
     dropped: QTable = field(default=None)
     centre_stddev: float = np.inf
+    pixel_integrated: bool = False
 
     def __repr__(self):
         return self._described()
@@ -142,9 +140,9 @@ class TunedMixtureField(Field):
         -------
         GaussianMixture
             Of as many Gaussians as ``start`` has there. It contains the
-            pixel.
+            pixel, unless the field is ``pixel_integrated``.
         """
-        known = known_shapes(self.start, [x], [y])
+        known = known_shapes(self.start, [x], [y], self.pixel_integrated)
         shapes, sign = TunedShapes().shapes(
             self.coefficients, self._basis(x, y), known)
         shift = TunedShapes.shifts(shapes, sign, known, self.centre_stddev)
@@ -179,19 +177,20 @@ class TunedMixtureField(Field):
         scale_at = getattr(self.start, 'scale_at', lambda x, y: 1.0)
         return GriddedMixturePSF(
             [self.mixture_at(*place) for place in places], places,
-            scales=[float(scale_at(*place)) for place in places])
+            scales=[float(scale_at(*place)) for place in places],
+            pixel_integrated=self.pixel_integrated)
 
 
-def known_shapes(start, x, y):
+def known_shapes(start, x, y, integrated):
     """
     Return what `TunedShapes` needs of a PSF at n places, (n, K, 8).
 
-    Where there are fewer Gaussians than elsewhere, some have no weight.
+    Optics that are not to be integrated get a Gaussian of the size of a
+    pixel. Where there are fewer Gaussians than elsewhere, some have no weight.
     """
-    pixel = (_PIXEL_VARIANCE * np.eye(2)
-             if getattr(start, 'pixel_integrated', False) else None)
     found = [start.mixture_at(*place) for place in zip(x, y, strict=True)]
-    if pixel is not None:
+    if getattr(start, 'pixel_integrated', False) and not integrated:
+        pixel = stages.PIXEL_VARIANCE * np.eye(2)
         found = [mixture.convolve(pixel) for mixture in found]
     most = max(mixture.n_components for mixture in found)
     shapes, signs = (np.zeros((len(found), most, 6)),

@@ -7,6 +7,7 @@ import numpy as np
 from photutils_mgauss.kernels.gaussian import LOG_NOTHING
 from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import back_substitute, clear, eliminate
+from photutils_mgauss.kernels.pixels import N_NODES, shape_integrals
 from photutils_mgauss.kernels.rows import render
 
 # A field of mixtures fitted to the stamps of n stars.
@@ -51,12 +52,14 @@ class FieldShapes(NamedTuple):
 
     basis (n, T), the polynomials at the star; jacobians (n, 6 K - 3, P), the
     derivatives of its shapes by the P numbers that are polynomials, or
-    (0, 0, 0) if they are the shapes themselves.
+    (0, 0, 0) if they are the shapes themselves; integrated, whether the rows
+    are integrated over pixels, not sampled.
     """
 
     basis: np.ndarray
     rows: np.ndarray
     jacobians: np.ndarray
+    integrated: bool
 
 
 class FieldSums(NamedTuple):
@@ -70,6 +73,29 @@ class FieldSums(NamedTuple):
     total: np.ndarray
     gradient: np.ndarray
     chi2: np.ndarray
+
+
+class _PixelScratch(NamedTuple):
+    """
+    Memory for the derivatives of pixels.
+
+    block (4, D); for a row of integrated pixels design (s, D), the integrals
+    of one Gaussian (6, s), nodes (2, 8) and edges (6, s + 1).
+    """
+
+    block: np.ndarray
+    design: np.ndarray
+    integrals: np.ndarray
+    nodes: np.ndarray
+    edges: np.ndarray
+
+
+@inner(allocates=True)
+def _scratch(n_columns, side, integrated):
+    side = side if integrated else 0
+    return _PixelScratch(
+        np.empty((4, n_columns)), np.empty((side, n_columns)),
+        np.empty((6, side)), np.empty((2, N_NODES)), np.empty((6, side + 1)))
 
 
 @inner
@@ -126,14 +152,60 @@ def _add_shape_derivatives(flux, g, by_x, by_y, pu, u, qy, dy, at, moves,
 
 
 @inner
-def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
-                fit_sky, with_shapes, block, normal):
+def _design_row(left, y, rows, sources, n_sources, first, size, scratch):
+    """
+    Put derivatives of a row of integrated pixels into the scratch's design.
+
+    As `_design` does of one pixel, with the model in the last column.
+    """
+    design, integrals = scratch.design, scratch.integrals
+    for i in range(design.shape[0]):
+        clear(design[i], size)
+    for j in range(n_sources):
+        for k in range(rows.shape[0]):
+            a, mx, my, p, s, q = rows[k]
+            if not shape_integrals(
+                    left - sources[j, 0] - mx, y - sources[j, 1] - my, p, s,
+                    q, scratch.nodes, scratch.edges, integrals):
+                continue
+            for i in range(design.shape[0]):
+                _add_integrals(a, sources[j, 2], integrals[:, i], 3 * j,
+                               first, k, size, design[i])
+
+
+@inner
+def _add_integrals(a, flux, integrals, own, first, k, size, row):
+    """Add Gaussian k in a pixel, its peak a, to the pixel's derivatives."""
+    value, by_x, by_y, by_p, by_s, by_q = integrals
+    af = a * flux
+    row[own] += af * by_x
+    row[own + 1] += af * by_y
+    row[own + 2] += a * value
+    row[size - 1] += af * value
+    if first < 0:
+        return
+    at = first + 6 * k - 3
+    if k > 0:
+        row[at] += af * value
+        row[at + 1] += af * by_x
+        row[at + 2] += af * by_y
+    row[at + 3] += af * by_p
+    row[at + 4] += af * by_s
+    row[at + 5] += af * by_q
+
+
+@inner
+def _accumulate(stamp, weight, left, bottom, psf, sources, n_sources, sky,
+                fit_sky, with_shapes, scratch, normal):
     """
     Sum the normal equations of a stamp into normal; return their size.
 
-    The size includes the column of the residual. block is scratch (4, D):
-    four pixels at a time save three of four walks through normal.
+    The size includes the column of the residual. psf are rows and whether
+    they are integrated. Four pixels at a time, those of scratch.block, save
+    three of four walks through normal.
     """
+    rows, integrated = psf
+    block = scratch.block
     own = 3 * n_sources + fit_sky
     size = own + 1
     first = -1
@@ -144,16 +216,24 @@ def _accumulate(stamp, weight, left, bottom, rows, sources, n_sources, sky,
         clear(normal[m], size)
     filled = 0
     for j in range(stamp.shape[0]):
+        if integrated:
+            _design_row(left, bottom + j, rows, sources, n_sources, first,
+                        size, scratch)
         for i in range(stamp.shape[1]):
             w = weight[j, i]
             if w <= 0:
                 continue
             row = block[filled]
-            clear(row, size)
+            if integrated:
+                for m in range(size):
+                    row[m] = scratch.design[i, m]
+                model = row[size - 1]
+            else:
+                clear(row, size)
+                model = _design(left + i, bottom + j, rows, sources,
+                                n_sources, first, row)
             if fit_sky:
                 row[own - 1] = 1.0
-            model = _design(left + i, bottom + j, rows, sources, n_sources,
-                            first, row)
             row[size - 1] = stamp[j, i] - sky - model
             root = sqrt(w)
             for m in range(size):
@@ -205,13 +285,13 @@ def _shift_sources(sources, n_sources, sky, fit_sky, step):
 
 
 @inner
-def _settle(i, stars, rows, fit_sky, with_shapes, block, normal, step):
+def _settle(i, stars, psf, fit_sky, with_shapes, scratch, normal, step):
     """Take a Gauss-Newton step of a star's own numbers, the PSF given."""
     left, bottom = stars.corners[i]
     sources, n_sources = stars.sources[i], stars.n_sources[i]
-    size = _accumulate(stars.stamps[i], stars.weights[i], left, bottom, rows,
+    size = _accumulate(stars.stamps[i], stars.weights[i], left, bottom, psf,
                        sources, n_sources, stars.sky[i], fit_sky, with_shapes,
-                       block, normal)
+                       scratch, normal)
     _hold_neighbours(sources, stars.anchors[i], n_sources, stars.hold[i],
                      size, normal)
     own = 3 * n_sources + fit_sky
@@ -232,9 +312,9 @@ def field_normal(stars, shapes, fit_sky, n_steps, normal, sums):
     chi2 and gradient are those after it. sources and, with fit_sky, sky of
     the stars change. normal is scratch (D, D) with D = 3 M + 6 K - 1.
     """
-    basis, rows, jacobians = shapes
+    basis, rows, jacobians, integrated = shapes
     total, gradient, chi2 = sums
-    block = np.empty((4, normal.shape[0]))
+    scratch = _scratch(normal.shape[0], stars.stamps.shape[2], integrated)
     step = np.empty(normal.shape[0])
     spread = np.empty(gradient.size)
     condensed = np.empty((jacobians.shape[2], jacobians.shape[2] + 1))
@@ -242,8 +322,8 @@ def field_normal(stars, shapes, fit_sky, n_steps, normal, sums):
         used = stars.used[star]
         own = 3 * stars.n_sources[star] + fit_sky
         for i in range(n_steps):
-            size = _settle(star, stars, rows[star], fit_sky,
-                           used and i == n_steps - 1, block, normal, step)
+            size = _settle(star, stars, (rows[star], integrated), fit_sky,
+                           used and i == n_steps - 1, scratch, normal, step)
         chi2[star] = normal[size - 1, size - 1]
         if not used:
             continue
@@ -295,7 +375,7 @@ def _spread(normal, own, size, basis, spread, total, gradient):
 
 
 @kernel
-def field_model(corners, rows, sources, n_sources, sky, out):
+def field_model(corners, rows, integrated, sources, n_sources, sky, out):
     """Put model stamps of n stars, neighbours and sky included, into out."""
     for star in range(out.shape[0]):
         left, bottom = corners[star]
@@ -304,4 +384,5 @@ def field_model(corners, rows, sources, n_sources, sky, out):
                 out[star, j, i] = sky[star]
         for j in range(n_sources[star]):
             x, y, flux = sources[star, j]
-            render(rows[star], x - left, y - bottom, flux, False, out[star])
+            render(rows[star], x - left, y - bottom, flux, integrated,
+                   out[star])

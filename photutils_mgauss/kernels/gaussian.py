@@ -3,6 +3,7 @@ from decimal import Decimal
 from math import ceil, erf, exp, factorial, sqrt
 
 import numpy as np
+from scipy.special import erfcx
 
 from photutils_mgauss.kernels.jit import (
     bits_of_float,
@@ -50,6 +51,37 @@ def fast_exp(x):
         series = series * r + term
     power = float_of_bits((bits_of_float(shifted) + 1023) << 52)
     return 0.0 if x < -688 else series * power
+
+
+# erfc(x) exp(x^2) (1 + 2 x) for x >= 0 is a polynomial of (x - c) / (x + c):
+# that of degree 20 leaves 4e-15. As with `fast_exp`, loops become vectors.
+_ERF_MIDDLE = 3.75
+
+
+def _scaled_erfc(t):
+    x = _ERF_MIDDLE * (1 + t) / (1 - t)
+    return (1 + 2 * x) * erfcx(x)
+
+
+_ERF_TERMS = tuple(np.polynomial.chebyshev.cheb2poly(
+    np.polynomial.chebyshev.chebinterpolate(_scaled_erfc, 20))[::-1])
+
+
+@inner
+def erfc_over_exp(x):
+    """Return erfc(x) exp(x^2) for x >= 0."""
+    below, factor = x + _ERF_MIDDLE, 1 + 2 * x
+    inverse = 1 / (below * factor)
+    t = (x - _ERF_MIDDLE) * factor * inverse
+    # In two halves: the compiler does not unroll a longer loop.
+    square = t * t
+    even = _ERF_TERMS[0]
+    for term in _ERF_TERMS[2::2]:
+        even = even * square + term
+    odd = _ERF_TERMS[1]
+    for term in _ERF_TERMS[3::2]:
+        odd = odd * square + term
+    return (even + t * odd) * below * inverse
 
 
 # One Gaussian at one point. (dx, dy) is the offset from the centre.
