@@ -12,11 +12,11 @@ from astropy.table import QTable
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import (
     core_width,
-    covariance_of,
     residual_stars,
     star_table,
 )
 from photutils_mgauss.field.choice import choose
+from photutils_mgauss.field.covariance import honest_covariance
 from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.input import possible_degree, read_sample
 from photutils_mgauss.field.mixture_field import MixtureField
@@ -179,18 +179,20 @@ def _known(problem, sample, start):
 def _tuned(fit, sample, start, radius, centre):
     sample = sample.without_deviant(fit.problem.used)
     stddev = _centre_stddev(start.mixture_at(*_middle(sample)), centre)
+    covariance, unmodelled = honest_covariance(fit)
     return TunedMixtureField(
-        start, fit.coefficients, sample.shape, radius, covariance_of(fit),
+        start, fit.coefficients, sample.shape, radius, covariance,
         star_table(fit, sample, stddev), residual_stars(fit), fit.accuracy,
-        sample.dropped(), stddev)
+        sample.dropped(), stddev, unmodelled)
 
 
 def _result(fit, sample, radius, choice, centre):
     sample = sample.without_deviant(fit.problem.used)
+    covariance, unmodelled = honest_covariance(fit)
     field = MixtureField(
-        fit.coefficients, sample.shape, radius, covariance_of(fit), None,
+        fit.coefficients, sample.shape, radius, covariance, None,
         residual_stars(fit), fit.accuracy, sample.dropped(), choice,
-        _exposure_table(fit, len(sample.reasons)))
+        _exposure_table(fit, len(sample.reasons)), unmodelled=unmodelled)
     stddev = _centre_stddev(field.mixture_at(*_middle(sample)), centre)
     return replace(field, stars=star_table(fit, sample, stddev),
                    centre_stddev=stddev)

@@ -1,0 +1,191 @@
+r"""
+The correlation of the noise of neighbouring pixels, from blank sky.
+
+Resampling an image (drizzling, reprojecting, shifting by parts of a pixel)
+spreads the noise of each pixel over its neighbours. Pulls d of blank pixels,
+data over errors, then have :math:`\rho(\Delta) = \langle d_i d_{i + \Delta}
+\rangle / \langle d_i^2 \rangle` other than zero.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.stats import mad_std
+from scipy.ndimage import binary_dilation, maximum_filter, minimum_filter
+
+# The largest distance along an axis [pix].
+_REACH = 4
+# Squares that are looked at: their side [pix] and their number.
+_SIDE, _SQUARES = 96, 12
+# With fewer pairs of pixels nothing is said.
+_FEWEST_PAIRS = 2000
+# Pixels beyond this many standard deviations, and those around them, are
+# light that nobody has listed.
+_LIGHT = 4.0
+# A correlation counts if it is beyond so many of its standard errors, and the
+# mean one of the nearest pixels is so large: 0.02 makes an error 4 % larger.
+_SIGNIFICANT, _LEAST = 5.0, 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseCorrelation:
+    """
+    The correlation of the noise of pixels.
+
+    Attributes
+    ----------
+    matrix : (2 m + 1, 2 m + 1) `~numpy.ndarray`
+        The correlation of two pixels at each distance (y, x), 1 in the
+        middle. Where blank sky scatters less than its errors say, all but
+        the middle is smaller by the square of that.
+    scatter : float
+        The scatter of blank sky in units of its errors.
+    """
+
+    matrix: np.ndarray
+    scatter: float
+
+    @property
+    def nearest(self):
+        """The correlations with the next pixel along x and y."""
+        return tuple(float(self.matrix[_REACH + dy, _REACH + dx])
+                     for dy, dx in ((0, 1), (1, 0)))
+
+    def __str__(self):
+        along_x, along_y = self.nearest
+        return ('The noise of neighbouring pixels is correlated, as in '
+                f'resampled images: by {along_x:.2f} along x and '
+                f'{along_y:.2f} along y, measured on blank sky.')
+
+
+def noise_correlation(image, x, y, margin):
+    """
+    Measure the correlation of the noise on blank sky.
+
+    Parameters
+    ----------
+    image : `~photutils_mgauss.kernels.Image`
+        With errors; without them nothing is found.
+    x, y : (n,) `~numpy.ndarray`
+        Known stars.
+    margin : float
+        How far around them pixels are not blank [pix].
+
+    Returns
+    -------
+    NoiseCorrelation or None
+        None if there is none that is significant.
+    """
+    if not image.error.size:
+        return None
+    finite = np.isfinite(x) & np.isfinite(y)
+    x, y = x[finite], y[finite]
+    size = 2 * _REACH + 1
+    products, pairs = np.zeros((size, size)), np.zeros((size, size))
+    for rows, columns in _squares(image.data.shape):
+        pulls = _blank_pulls(image, rows, columns, x, y, margin)
+        _add_products(pulls, products, pairs)
+    if pairs[_REACH, _REACH] < _FEWEST_PAIRS or (
+            products[_REACH, _REACH] <= 0):
+        return None
+    variance = products[_REACH, _REACH] / pairs[_REACH, _REACH]
+    matrix = np.divide(products, pairs * variance, where=pairs > 0,
+                       out=np.zeros_like(products))
+    matrix = (matrix + matrix[::-1, ::-1]) / 2
+    # Pairs are correlated with each other, if pixels are.
+    deviation = np.sqrt((matrix**2).sum() / np.maximum(pairs, 1))
+    near = [matrix[_REACH, _REACH + 1], matrix[_REACH + 1, _REACH]]
+    if not (np.mean(near) > _LEAST
+            and np.mean(near) > _SIGNIFICANT * deviation[_REACH, _REACH]):
+        return None
+    matrix[np.abs(matrix) < _SIGNIFICANT * deviation] = 0
+    # Blank sky that scatters less than its errors has them from the time
+    # before the image was resampled, and errors are right already.
+    matrix *= min(variance, 1)
+    matrix[_REACH, _REACH] = 1
+    return NoiseCorrelation(matrix, float(np.sqrt(variance)))
+
+
+def _squares(shape):
+    """Return slices of squares spread evenly over an image."""
+    columns = max(1, round(np.sqrt(_SQUARES * shape[1] / shape[0])))
+    counts = (max(1, round(_SQUARES / columns)), columns)
+    starts = [np.unique(np.linspace(0, max(size - _SIDE, 0), min(
+        count, -(-size // _SIDE))).astype(int))
+        for size, count in zip(shape, counts, strict=True)]
+    return [(slice(row, row + _SIDE), slice(column, column + _SIDE))
+            for row in starts[0] for column in starts[1]]
+
+
+def _blank_pulls(image, rows, columns, x, y, margin):
+    """Return data over errors of blank pixels less their median, else NaN."""
+    data, error = image.data[rows, columns], image.error[rows, columns]
+    with np.errstate(invalid='ignore', divide='ignore'):
+        pulls = data / error
+    usable = np.isfinite(pulls) & (error > 0)
+    if image.mask.size:
+        usable &= ~image.mask[rows, columns]
+    # Padding: a value repeated all around is no noise.
+    usable &= (maximum_filter(data, 3) != minimum_filter(data, 3))
+    height, width = data.shape
+    near = ((x > columns.start - margin)
+            & (x < columns.start + width + margin)
+            & (y > rows.start - margin) & (y < rows.start + height + margin))
+    for x_0, y_0 in zip(x[near] - columns.start, y[near] - rows.start,
+                        strict=True):
+        box = tuple(slice(max(int(np.ceil(at - margin)), 0),
+                          max(int(at + margin) + 1, 0)) for at in (y_0, x_0))
+        usable[box] = False
+    if np.count_nonzero(usable) < 100:
+        return np.full(data.shape, np.nan)
+    pulls = pulls - np.median(pulls[usable])
+    light = usable & (np.abs(pulls) > _LIGHT * mad_std(pulls[usable]))
+    usable &= ~binary_dilation(light, iterations=3)
+    pulls[~usable] = np.nan
+    if usable.any():
+        pulls -= np.nanmean(pulls)
+    return pulls
+
+
+def _add_products(pulls, products, pairs):
+    """Add the products of all pairs of pixels, and how many there are."""
+    good = np.isfinite(pulls)
+    values = np.where(good, pulls, 0)
+    good = good.astype(float)
+    height, width = values.shape
+    for dy in range(_REACH + 1):
+        for dx in range(-_REACH if dy else 0, _REACH + 1):
+            if dy >= height or abs(dx) >= width:
+                continue
+            one = (slice(0, height - dy),
+                   slice(max(-dx, 0), width - max(dx, 0)))
+            other = (slice(dy, height),
+                     slice(max(dx, 0), width - max(-dx, 0)))
+            for array, total in ((values, products), (good, pairs)):
+                found = np.vdot(array[one], array[other])
+                total[_REACH + dy, _REACH + dx] += found
+                if dy or dx:
+                    total[_REACH - dy, _REACH - dx] += found
+
+
+def pixel_correlation(matrix, shape):
+    """
+    Return the correlation of all pixels of a stamp with each other.
+
+    Parameters
+    ----------
+    matrix : (2 m + 1, 2 m + 1) `~numpy.ndarray`
+        That of two pixels at each distance.
+    shape : (int, int)
+        Of the stamp.
+
+    Returns
+    -------
+    (pixels, pixels) `~numpy.ndarray`
+    """
+    reach = len(matrix) // 2
+    y, x = (axis.ravel() for axis in np.mgrid[:shape[0], :shape[1]])
+    dy, dx = y[:, None] - y, x[:, None] - x
+    near = (np.abs(dy) <= reach) & (np.abs(dx) <= reach)
+    out = np.zeros(dy.shape)
+    out[near] = matrix[dy[near] + reach, dx[near] + reach]
+    return out
