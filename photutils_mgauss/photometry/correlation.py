@@ -3,24 +3,32 @@ The correlation of the noise of neighbouring pixels, from blank sky.
 
 Resampling an image (drizzling, reprojecting, shifting by parts of a pixel)
 spreads the noise of each pixel over its neighbours. Pulls d of blank pixels,
-data over errors, then have :math:`\rho(\Delta) = \langle d_i d_{i + \Delta}
-\rangle / \langle d_i^2 \rangle` other than zero.
+data over errors, then have products :math:`\langle d_i d_{i + \Delta}
+\rangle` other than zero at short distances. Faint light and an uneven sky have
+them as well, but as large at long ones: the mean of those at the longest is
+subtracted from all.
 """
 from dataclasses import dataclass
 
 import numpy as np
 from astropy.stats import mad_std
-from scipy.ndimage import binary_dilation, maximum_filter, minimum_filter
+from scipy.ndimage import (
+    binary_dilation,
+    maximum_filter,
+    minimum_filter,
+    uniform_filter,
+)
 
 # The largest distance along an axis [pix].
-_REACH = 4
-# Squares that are looked at: their side [pix] and their number.
-_SIDE, _SQUARES = 96, 12
+_REACH = 5
+# Squares that are looked at: their number and their side [pix]; few at first,
+# and more if noise seems to be correlated there.
+_FIRST, _ALL = (6, 64), (12, 96)
 # With fewer pairs of pixels nothing is said.
 _FEWEST_PAIRS = 2000
-# Pixels beyond this many standard deviations, and those around them, are
-# light that nobody has listed.
-_LIGHT = 4.0
+# Means over squares of these sides [pix] beyond this many standard deviations,
+# and pixels around them, are light that nobody has listed.
+_SIDES, _LIGHT = (1, 3, 7), 3.5
 # A correlation counts if it is beyond so many of its standard errors, and the
 # mean one of the nearest pixels is so large: 0.02 makes an error 4 % larger.
 _SIGNIFICANT, _LEAST = 5.0, 0.02
@@ -79,20 +87,32 @@ def noise_correlation(image, x, y, margin):
         return None
     finite = np.isfinite(x) & np.isfinite(y)
     x, y = x[finite], y[finite]
+    stars = x, y, margin
+    if _in_squares(image, stars, *_FIRST) is None:
+        return None
+    return _in_squares(image, stars, *_ALL)
+
+
+def _in_squares(image, stars, number, side):
+    """Return the correlation in some squares, or None."""
     size = 2 * _REACH + 1
     products, pairs = np.zeros((size, size)), np.zeros((size, size))
-    for rows, columns in _squares(image.data.shape):
-        pulls = _blank_pulls(image, rows, columns, x, y, margin)
-        _add_products(pulls, products, pairs)
-    if pairs[_REACH, _REACH] < _FEWEST_PAIRS or (
-            products[_REACH, _REACH] <= 0):
+    for rows, columns in _squares(image.data.shape, number, side):
+        _add_products(_blank_pulls(image, rows, columns, *stars), products,
+                      pairs)
+    if pairs.min() < _FEWEST_PAIRS:
         return None
-    variance = products[_REACH, _REACH] / pairs[_REACH, _REACH]
-    matrix = np.divide(products, pairs * variance, where=pairs > 0,
+    matrix = np.divide(products, pairs, where=pairs > 0,
                        out=np.zeros_like(products))
-    matrix = (matrix + matrix[::-1, ::-1]) / 2
+    ring = np.ones(matrix.shape, bool)
+    ring[1:-1, 1:-1] = False
+    matrix -= matrix[ring].mean()
+    variance = matrix[_REACH, _REACH]
+    if variance <= 0:
+        return None
+    matrix /= variance
     # Pairs are correlated with each other, if pixels are.
-    deviation = np.sqrt((matrix**2).sum() / np.maximum(pairs, 1))
+    deviation = np.sqrt((matrix**2).sum() / pairs)
     near = [matrix[_REACH, _REACH + 1], matrix[_REACH + 1, _REACH]]
     if not (np.mean(near) > _LEAST
             and np.mean(near) > _SIGNIFICANT * deviation[_REACH, _REACH]):
@@ -105,14 +125,14 @@ def noise_correlation(image, x, y, margin):
     return NoiseCorrelation(matrix, float(np.sqrt(variance)))
 
 
-def _squares(shape):
+def _squares(shape, number, side):
     """Return slices of squares spread evenly over an image."""
-    columns = max(1, round(np.sqrt(_SQUARES * shape[1] / shape[0])))
-    counts = (max(1, round(_SQUARES / columns)), columns)
-    starts = [np.unique(np.linspace(0, max(size - _SIDE, 0), min(
-        count, -(-size // _SIDE))).astype(int))
+    columns = max(1, round(np.sqrt(number * shape[1] / shape[0])))
+    counts = (max(1, round(number / columns)), columns)
+    starts = [np.unique(np.linspace(0, max(size - side, 0), min(
+        count, -(-size // side))).astype(int))
         for size, count in zip(shape, counts, strict=True)]
-    return [(slice(row, row + _SIDE), slice(column, column + _SIDE))
+    return [(slice(row, row + side), slice(column, column + side))
             for row in starts[0] for column in starts[1]]
 
 
@@ -137,9 +157,11 @@ def _blank_pulls(image, rows, columns, x, y, margin):
         usable[box] = False
     if np.count_nonzero(usable) < 100:
         return np.full(data.shape, np.nan)
-    pulls = pulls - np.median(pulls[usable])
-    light = usable & (np.abs(pulls) > _LIGHT * mad_std(pulls[usable]))
-    usable &= ~binary_dilation(light, iterations=3)
+    pulls = np.where(usable, pulls - np.median(pulls[usable]), 0)
+    for side in _SIDES:
+        mean = uniform_filter(pulls, side)
+        light = usable & (np.abs(mean) > _LIGHT * mad_std(mean[usable]))
+        usable &= ~binary_dilation(light, iterations=2 + side // 2)
     pulls[~usable] = np.nan
     if usable.any():
         pulls -= np.nanmean(pulls)
