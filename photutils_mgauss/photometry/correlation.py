@@ -111,6 +111,10 @@ def _in_squares(image, stars, number, side):
     if variance <= 0:
         return None
     matrix /= variance
+    # Blank sky that scatters less than its errors has them from the time
+    # before the image was resampled, and errors are right already.
+    matrix *= min(variance, 1)
+    matrix[_REACH, _REACH] = 1
     # Pairs are correlated with each other, if pixels are.
     deviation = np.sqrt((matrix**2).sum() / pairs)
     near = [matrix[_REACH, _REACH + 1], matrix[_REACH + 1, _REACH]]
@@ -118,10 +122,6 @@ def _in_squares(image, stars, number, side):
             and np.mean(near) > _SIGNIFICANT * deviation[_REACH, _REACH]):
         return None
     matrix[np.abs(matrix) < _SIGNIFICANT * deviation] = 0
-    # Blank sky that scatters less than its errors has them from the time
-    # before the image was resampled, and errors are right already.
-    matrix *= min(variance, 1)
-    matrix[_REACH, _REACH] = 1
     return NoiseCorrelation(matrix, float(np.sqrt(variance)))
 
 
@@ -155,17 +155,16 @@ def _blank_pulls(image, rows, columns, x, y, margin):
         box = tuple(slice(max(int(np.ceil(at - margin)), 0),
                           max(int(at + margin) + 1, 0)) for at in (y_0, x_0))
         usable[box] = False
-    if np.count_nonzero(usable) < 100:
-        return np.full(data.shape, np.nan)
-    pulls = np.where(usable, pulls - np.median(pulls[usable]), 0)
+    pulls = np.where(usable, pulls, 0)
+    pulls -= np.median(pulls[usable]) if usable.any() else 0
     for side in _SIDES:
+        if not usable.any():
+            break
         mean = uniform_filter(pulls, side)
         light = usable & (np.abs(mean) > _LIGHT * mad_std(mean[usable]))
         usable &= ~binary_dilation(light, iterations=2 + side // 2)
     pulls[~usable] = np.nan
-    if usable.any():
-        pulls -= np.nanmean(pulls)
-    return pulls
+    return pulls - np.mean(pulls[usable]) if usable.any() else pulls
 
 
 def _add_products(pulls, products, pairs):
@@ -187,27 +186,3 @@ def _add_products(pulls, products, pairs):
                 total[_REACH + dy, _REACH + dx] += found
                 if dy or dx:
                     total[_REACH - dy, _REACH - dx] += found
-
-
-def pixel_correlation(matrix, shape):
-    """
-    Return the correlation of all pixels of a stamp with each other.
-
-    Parameters
-    ----------
-    matrix : (2 m + 1, 2 m + 1) `~numpy.ndarray`
-        That of two pixels at each distance.
-    shape : (int, int)
-        Of the stamp.
-
-    Returns
-    -------
-    (pixels, pixels) `~numpy.ndarray`
-    """
-    reach = len(matrix) // 2
-    y, x = (axis.ravel() for axis in np.mgrid[:shape[0], :shape[1]])
-    dy, dx = y[:, None] - y, x[:, None] - x
-    near = (np.abs(dy) <= reach) & (np.abs(dx) <= reach)
-    out = np.zeros(dy.shape)
-    out[near] = matrix[dy[near] + reach, dx[near] + reach]
-    return out
