@@ -202,7 +202,7 @@ def shape_covariance(covariance, unmodelled, basis):
     return np.einsum('nptq,nt->npq', half, basis) + np.diag(unmodelled)
 
 
-def psf_errors(at, covariance, unmodelled, degree, shape, accuracy):
+def psf_errors(at, covariance, unmodelled, degree, shape):
     """
     Return the errors of a field's PSF.
 
@@ -215,7 +215,6 @@ def psf_errors(at, covariance, unmodelled, degree, shape, accuracy):
     degree : int
     shape : (int, int)
         Of the detector.
-    accuracy : float
 
     Returns
     -------
@@ -231,8 +230,7 @@ def psf_errors(at, covariance, unmodelled, degree, shape, accuracy):
                       _STEP * np.eye(unmodelled.size)], axis=1)
     grid = Grid(np.unique(x), np.unique(y), *mixtures, np.ones(x.size))
     found = shape_covariance(covariance, unmodelled, basis)
-    return PSFErrors(grid, _directions(PSFErrors(grid, every), found),
-                     float(accuracy))
+    return PSFErrors(grid, _directions(PSFErrors(grid, every), found))
 
 
 def _slopes(at, x, y, step):

@@ -18,7 +18,11 @@ from photutils_mgauss.field.base import (
 from photutils_mgauss.field.choice import choose
 from photutils_mgauss.field.covariance import honest_covariance
 from photutils_mgauss.field.forms import TunedShapes
-from photutils_mgauss.field.input import possible_degree, read_sample
+from photutils_mgauss.field.input import (
+    allow_for_correlation,
+    possible_degree,
+    read_sample,
+)
 from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.field.normal import Workers
 from photutils_mgauss.field.tuned_field import TunedMixtureField, known_shapes
@@ -33,7 +37,8 @@ _DEGREE, _TUNED_DEGREE = 4, 1
 def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
                       degree=None, radius=10, local_bkg=False,
                       effective_gain=None, reject=True, regularization=1.0,
-                      start=None, centre='core', executor=None):
+                      start=None, centre='core', correlated_noise=True,
+                      executor=None):
     """
     Fit a PSF field to the pixels of stars.
 
@@ -101,6 +106,10 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
         full width at half maximum in the middle of the detector; or the flux
         centroid, which wanders from image to image with the noise of the
         wings. With ``start`` it stays where that of ``start`` is.
+    correlated_noise : bool, optional
+        Whether to look, on blank sky, if the noise of neighbouring pixels is
+        correlated, as in resampled images, and to take errors as larger for
+        that; a warning says so.
     executor : `~concurrent.futures.Executor`, optional
         Where stars are worked on; by default a pool of threads.
 
@@ -137,6 +146,8 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
                'reject': reject}
     as_choice(centre, 'centre', ('core', 'flux'))
     sample = read_sample(data, stars, error, mask, radius, effective_gain)
+    if correlated_noise:
+        allow_for_correlation(sample)
     top = possible_degree(degree, len(sample.row))
     problem = sample.problem(top, local_bkg)
     with Workers(executor) as workers:

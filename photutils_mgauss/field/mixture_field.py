@@ -229,8 +229,7 @@ class MixtureField(Field):
         return psf_errors(
             lambda x, y, change: (self._basis(x, y), *self._mixtures(
                 x, y, exposure, change)[:3]),
-            self.covariance, unmodelled, self.degree, self.shape,
-            self.accuracy)
+            self.covariance, unmodelled, self.degree, self.shape)
 
     def _blur(self, exposure):
         n = 1 if self.exposures is None else len(self.exposures)

@@ -184,7 +184,7 @@ class TunedMixtureField(Field):
         if unmodelled is None:
             unmodelled = np.zeros(self.coefficients.shape[1])
         return psf_errors(at, self.covariance, unmodelled, self.degree,
-                          self.shape, self.accuracy)
+                          self.shape)
 
     def to_grid(self, grid_shape=None):
         """

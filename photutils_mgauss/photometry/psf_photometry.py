@@ -21,10 +21,10 @@ from photutils.psf import PSFPhotometry
 
 from photutils_mgauss.photometry import engine
 from photutils_mgauss.photometry import table as _table
-from photutils_mgauss.photometry.correlation import noise_correlation
 from photutils_mgauss.photometry.errors import with_all_errors
 from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
 from photutils_mgauss.utils import compat
+from photutils_mgauss.utils.correlated_noise import noise_correlation
 from photutils_mgauss.utils.image import read_pixels, with_unit
 from photutils_mgauss.utils.per_thread import PerThread, keep
 from photutils_mgauss.utils.star_columns import plain_values
@@ -239,7 +239,8 @@ class MixturePSFPhotometry(PSFPhotometry):
         """Return the correlation of the noise if it counts."""
         if not self.correlated_noise:
             return None
-        return noise_correlation(image, *result.values[:, 1:].T,
+        return noise_correlation(image.data, image.error, image.mask,
+                                 *result.values[:, 1:].T,
                                  max(self.fit_shape) / 2 + 3)
 
     def _tell_of_correlation(self):

@@ -28,7 +28,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 _NODES, _WEIGHTS = _NODES / 2, _WEIGHTS / 2
 # The columns of a file, and their units.
 COLUMNS = {'x': 'pix', 'y': 'pix', 'weight': '', 'mean': 'pix',
-           'covariance': 'pix2', 'change': '', 'accuracy': ''}
+           'covariance': 'pix2', 'change': ''}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +44,10 @@ class PSFErrors:
         R independent changes of one standard deviation: of the weight, the
         mean x and y [pix] and the covariance xx, xy and yy [pix^2] of each
         Gaussian.
-    accuracy : float
-        The relative error of each pixel of the PSF, independent of that of
-        all others.
     """
 
     grid: Grid
     changes: np.ndarray
-    accuracy: float = 0.0
 
     def __post_init__(self):
         self.changes.flags.writeable = False
@@ -135,15 +131,14 @@ class PSFErrors:
         return PSFErrors(Grid(
             grid.x_grid, grid.y_grid, weights.reshape(m, -1),
             means.reshape(m, -1, 2), covariances.reshape(m, -1, 2, 2),
-            grid.scales), changes, self.accuracy)
+            grid.scales), changes)
 
     def to_columns(self):
         """Return what a file holds of the errors, a row for each place."""
         x, y = self.grid.positions.T
         return {'x': x, 'y': y, 'weight': self.grid.weights,
                 'mean': self.grid.means, 'covariance': self.grid.covariances,
-                'change': self.changes,
-                'accuracy': np.full(len(x), float(self.accuracy))}
+                'change': self.changes}
 
     @classmethod
     def from_columns(cls, columns):
@@ -168,11 +163,10 @@ class PSFErrors:
             columns['mean'].reshape(n, k, 2),
             columns['covariance'].reshape(n, k, 2, 2), np.ones(n))
         changes = columns['change'].reshape(n, -1, k, 6)
-        accuracy = float(columns['accuracy'][0])
-        if not (np.isfinite(changes).all() and 0 <= accuracy < np.inf):
+        if not np.isfinite(changes).all():
             msg = 'errors of a PSF must be finite, got NaN or infinity'
             raise ValueError(msg)
-        return cls(grid, np.array(changes), accuracy)
+        return cls(grid, np.array(changes))
 
 
 def responses(design, weight, changes):

@@ -170,10 +170,6 @@ class StarPixels:
         n_free = self.free.size
         shifts = shifts[:, :n_free]
         psf = shifts @ shifts.transpose(0, 2, 1)
-        if self.psf.accuracy:
-            psf += _sandwich(design, inverse, weight * self.psf.accuracy
-                             * np.maximum(images[:, 0], 0))[:, :n_free,
-                                                            :n_free]
         units = np.where(self.free == 0, flux[:, None], 1.0)
         psf *= units[:, :, None] * units[:, None]
         if matrix is None:
@@ -211,12 +207,6 @@ class StarPixels:
         usable = (inside.reshape(light.shape) & (variance > 0)
                   & np.isfinite(variance))
         return np.where(usable, 1 / np.where(usable, variance, 1), 0)
-
-
-def _sandwich(design, inverse, deviation):
-    """Return the covariances due to independent deviations of pixels."""
-    moved = (inverse @ design) * deviation[:, None]
-    return moved @ moved.transpose(0, 2, 1)
 
 
 def _growth(design, inverse, root, matrix, n_free):

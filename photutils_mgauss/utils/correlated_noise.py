@@ -58,6 +58,27 @@ class NoiseCorrelation:
         return tuple(float(self.matrix[_REACH + dy, _REACH + dx])
                      for dy, dx in ((0, 1), (1, 0)))
 
+    def growth(self, width):
+        """
+        Return by how much the variance of a star's position grows.
+
+        Parameters
+        ----------
+        width : float
+            The standard deviation of the PSF [pix].
+
+        Returns
+        -------
+        float
+            For a Gaussian among pixels of one error, the sum of the
+            correlations times the overlap of the star's derivative with
+            itself at each distance.
+        """
+        steps = np.arange(-_REACH, _REACH + 1)
+        square = (steps**2 + steps[:, None]**2) / (4 * width**2)
+        overlap = (1 - square) * np.exp(-square)
+        return max(1.0, float((self.matrix * overlap).sum()))
+
     def __str__(self):
         along_x, along_y = self.nearest
         return ('The noise of neighbouring pixels is correlated, as in '
@@ -65,14 +86,16 @@ class NoiseCorrelation:
                 f'{along_y:.2f} along y, measured on blank sky.')
 
 
-def noise_correlation(image, x, y, margin):
+def noise_correlation(data, error, mask, x, y, margin):
     """
     Measure the correlation of the noise on blank sky.
 
     Parameters
     ----------
-    image : `~photutils_mgauss.kernels.Image`
-        With errors; without them nothing is found.
+    data, error : (ny, nx) `~numpy.ndarray`
+        Without errors, an empty array, nothing is found.
+    mask : (ny, nx) `~numpy.ndarray` of bool
+        True for pixels to leave out; may be empty.
     x, y : (n,) `~numpy.ndarray`
         Known stars.
     margin : float
@@ -83,8 +106,9 @@ def noise_correlation(image, x, y, margin):
     NoiseCorrelation or None
         None if there is none that is significant.
     """
-    if not image.error.size:
+    if not error.size:
         return None
+    image = data, error, mask
     finite = np.isfinite(x) & np.isfinite(y)
     x, y = x[finite], y[finite]
     stars = x, y, margin
@@ -97,7 +121,7 @@ def _in_squares(image, stars, number, side):
     """Return the correlation in some squares, or None."""
     size = 2 * _REACH + 1
     products, pairs = np.zeros((size, size)), np.zeros((size, size))
-    for rows, columns in _squares(image.data.shape, number, side):
+    for rows, columns in _squares(image[0].shape, number, side):
         _add_products(_blank_pulls(image, rows, columns, *stars), products,
                       pairs)
     if pairs.min() < _FEWEST_PAIRS:
@@ -138,12 +162,12 @@ def _squares(shape, number, side):
 
 def _blank_pulls(image, rows, columns, x, y, margin):
     """Return data over errors of blank pixels less their median, else NaN."""
-    data, error = image.data[rows, columns], image.error[rows, columns]
+    data, error = (array[rows, columns] for array in image[:2])
     with np.errstate(invalid='ignore', divide='ignore'):
         pulls = data / error
     usable = np.isfinite(pulls) & (error > 0)
-    if image.mask.size:
-        usable &= ~image.mask[rows, columns]
+    if image[2].size:
+        usable &= ~image[2][rows, columns]
     # Padding: a value repeated all around is no noise.
     usable &= (maximum_filter(data, 3) != minimum_filter(data, 3))
     height, width = data.shape
