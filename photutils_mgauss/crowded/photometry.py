@@ -22,6 +22,7 @@ from photutils_mgauss.crowded.table import (
 from photutils_mgauss.crowded.tile import TileOptions
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.psf.renderer import MixtureRenderer
+from photutils_mgauss.psf.star_errors import add_psf_errors
 from photutils_mgauss.utils.checkpoint import Checkpoint
 from photutils_mgauss.utils.flags import REPEATED, decode
 from photutils_mgauss.utils.image import read_pixels, with_unit
@@ -146,6 +147,10 @@ class CrowdedMixturePhotometry:
     checkpoint : str or path-like, optional
         A folder in which finished tiles are kept. A call with the same image
         and settings takes them from there, whatever ended the first one.
+    psf_errors : bool, optional
+        Whether the errors contain what the PSF may be off, if ``psf_model``
+        knows that, as the grid of a `MixtureField` does; see
+        `MixturePSFPhotometry`. Each star is taken by itself for this.
     find_neighbors : bool, optional
         Whether stars that are missing from a given list are found and fitted
         together with those on it. They are not reported. Otherwise the list
@@ -168,8 +173,9 @@ class CrowdedMixturePhotometry:
     Notes
     -----
     Columns beside photutils' own: ``xy_cov``, the covariance of x and y
-    [pix^2]; ``significance`` of the detection; ``crowding``, the star's share
-    of the light of all stars in its fit pixels; ``neighbor_distance`` [pix]
+    [pix^2]; ``x_psf_err``, ``y_psf_err`` and ``flux_psf_err``, the part of the
+    errors that is due to the PSF, if it is known; ``significance`` of the
+    detection; ``crowding``, the star's share of the light of all stars in its fit pixels; ``neighbor_distance`` [pix]
     and ``neighbor_correlation``, the correlation with the nearest
     neighbour's flux; ``iter_detected``. Bits of ``flags`` beside photutils'
     own: 65536, most of the star is masked, as of saturated ones; 131072, a
@@ -205,7 +211,8 @@ class CrowdedMixturePhotometry:
                  count_slope=1.5, background_size=64, psf_error=0.01,
                  effective_gain=None, maxiters=3, tile_shape=None,
                  overlap=128, executor=None, progress_bar=False,
-                 find_neighbors=True, xy_bounds=1.0, checkpoint=None):
+                 find_neighbors=True, xy_bounds=1.0, checkpoint=None,
+                 psf_errors=True):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
         self.keep = as_real(keep, 'keep', minimum=0)
@@ -236,6 +243,7 @@ class CrowdedMixturePhotometry:
         self.results = None
         self._noise = np.inf
         self._psf = LocalPSF.of(psf_model)
+        self.psf_errors = bool(psf_errors)
 
     def __call__(self, data, *, mask=None, error=None, init_params=None):
         """
@@ -281,6 +289,9 @@ class CrowdedMixturePhotometry:
                                                     strict=True)
                       if outcome is None]
         table = self._table(outcomes, given, image.unit)
+        if self.psf_errors:
+            add_psf_errors(table, image, self.psf_model,
+                           executor=self.executor)
         keep(self, results=table, _noise=options.noise)
         if unfinished:
             raise UnfinishedTilesError(unfinished, table) from errors[0]

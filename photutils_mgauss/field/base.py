@@ -140,7 +140,9 @@ def star_table(fit, sample, centre_stddev):
         fit, centre_stddev).T
     table['flux_fit'] = with_unit(flux, sample.unit)
     table['local_bkg'] = with_unit(problem.sky, sample.unit)
-    table['reduced_chi2'] = fit.equations.chi2 / np.maximum(n_pixels - 3, 1)
+    growth = sample.growth[sample.exposure]
+    table['reduced_chi2'] = (growth * fit.equations.chi2
+                             / np.maximum(n_pixels - 3, 1))
     table['n_pixels_fit'] = n_pixels
     table['n_pixels_rejected'] = fit.deviant_pixels.sum(axis=(1, 2))
     table['used'] = problem.used

@@ -12,13 +12,17 @@ from astropy.table import QTable
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import (
     core_width,
-    covariance_of,
     residual_stars,
     star_table,
 )
 from photutils_mgauss.field.choice import choose
+from photutils_mgauss.field.covariance import honest_covariance
 from photutils_mgauss.field.forms import TunedShapes
-from photutils_mgauss.field.input import possible_degree, read_sample
+from photutils_mgauss.field.input import (
+    allow_for_correlation,
+    possible_degree,
+    read_sample,
+)
 from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.field.normal import Workers
 from photutils_mgauss.field.pixel import chosen_pixel, warn_of_phase
@@ -35,6 +39,7 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
                       degree=None, radius=10, local_bkg=False,
                       effective_gain=None, reject=True, regularization=1.0,
                       start=None, centre='core', pixel_integrated='auto',
+                      correlated_noise=True,
                       executor=None):
     """
     Fit a PSF field to the pixels of stars.
@@ -111,6 +116,10 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
         pixels, full width at half maximum in the pixels, are integrated.
         With ``start`` it is as in ``start``, whose optics can be sampled but
         not the reverse.
+    correlated_noise : bool, optional
+        Whether to look, on blank sky, if the noise of neighbouring pixels is
+        correlated, as in resampled images, and to take errors as larger for
+        that; a warning says so.
     executor : `~concurrent.futures.Executor`, optional
         Where stars are worked on; by default a pool of threads.
 
@@ -148,6 +157,8 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
     as_choice(centre, 'centre', ('core', 'flux'))
     pixel_integrated = _pixel_integrated(pixel_integrated, start)
     sample = read_sample(data, stars, error, mask, radius, effective_gain)
+    if correlated_noise:
+        allow_for_correlation(sample)
     top = possible_degree(degree, len(sample.row))
     problem = sample.problem(top, local_bkg)
     with Workers(executor) as workers:
@@ -210,20 +221,21 @@ def _tuned(fit, sample, start, radius, centre):
     sample = sample.without_deviant(fit.problem.used)
     stddev = _centre_stddev(start.mixture_at(*_middle(sample)), centre,
                             bool(getattr(start, 'pixel_integrated', False)))
-    integrated = fit.problem.pixel_integrated
+    covariance, unmodelled = honest_covariance(fit)
     return TunedMixtureField(
-        start, fit.coefficients, sample.shape, radius, covariance_of(fit),
+        start, fit.coefficients, sample.shape, radius, covariance,
         star_table(fit, sample, stddev), residual_stars(fit), fit.accuracy,
-        sample.dropped(), stddev, integrated)
+        sample.dropped(), stddev, fit.problem.pixel_integrated, unmodelled)
 
 
 def _result(fit, sample, radius, choice, centre):
     sample = sample.without_deviant(fit.problem.used)
+    covariance, unmodelled = honest_covariance(fit)
     field = MixtureField(
-        fit.coefficients, sample.shape, radius, covariance_of(fit), None,
+        fit.coefficients, sample.shape, radius, covariance, None,
         residual_stars(fit), fit.accuracy, sample.dropped(), choice,
         _exposure_table(fit, len(sample.reasons)),
-        pixel_integrated=fit.problem.pixel_integrated)
+        pixel_integrated=fit.problem.pixel_integrated, unmodelled=unmodelled)
     middle = field.mixture_at(*_middle(sample))
     if not field.pixel_integrated:
         warn_of_phase(middle)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from numbers import Real
 
 import numpy as np
+from astropy.stats import mad_std
 from astropy.table import QTable, Table
 from astropy.utils.exceptions import AstropyUserWarning
 
@@ -12,6 +13,7 @@ from photutils_mgauss.field.choice import DEGREES
 from photutils_mgauss.field.forms import FreeShapes
 from photutils_mgauss.field.normal import FieldProblem
 from photutils_mgauss.field.stamps import Stamps, cut_stamps, remove_star_noise
+from photutils_mgauss.utils.correlated_noise import noise_correlation
 from photutils_mgauss.utils.image import read_pixels
 from photutils_mgauss.utils.star_columns import read_sources
 
@@ -47,6 +49,10 @@ class Sample:
         As given.
     unit : `~astropy.units.UnitBase` or None
         Of the pixels.
+    correlations : list of NoiseCorrelation or None
+        What the noise of neighbouring pixels of each exposure has in common.
+    growth : (E,) `~numpy.ndarray`
+        By how much the variances in ``stamps`` are larger for it.
     """
 
     stamps: Stamps
@@ -58,6 +64,8 @@ class Sample:
     shape: tuple
     catalogues: list
     unit: object
+    correlations: list
+    growth: np.ndarray
 
     def expected(self):
         """Return x and y (n,) of the stars in their tables."""
@@ -129,7 +137,43 @@ def read_sample(data, stars, error, mask, radius, gain):
         np.repeat(np.arange(len(parts)), [len(part[1]) for part in parts]),
         np.concatenate([part[1] for part in parts]),
         [part[3] for part in parts], exposures[0][0].shape,
-        [part[2] for part in parts], exposures[0][0].unit)
+        [part[2] for part in parts], exposures[0][0].unit,
+        [_correlation(pixels, part[2], radius)
+         for (pixels, _), part in zip(exposures, parts, strict=True)],
+        np.ones(len(parts)))
+
+
+def _correlation(pixels, sources, radius):
+    """Return the correlation of the noise of an exposure, or None."""
+    error = pixels.error
+    if error is None:
+        error = mad_std(pixels.data, ignore_nan=True)
+    return noise_correlation(
+        pixels.data, np.broadcast_to(error, pixels.shape),
+        np.empty((0, 0)) if pixels.mask is None else pixels.mask, sources.x,
+        sources.y, radius)
+
+
+def allow_for_correlation(sample):
+    """
+    Enlarge the variances of stamps for correlated noise, in place, and warn.
+
+    The stamps then know as much of a PSF as their pixels do, though as
+    independent ones: the curvature of chi^2 is that of the errors.
+    """
+    if not any(sample.correlations):
+        return
+    width = stages.first_width(sample)
+    sample.growth[:] = [1 if one is None else one.growth(width)
+                        for one in sample.correlations]
+    factor = sample.growth[sample.exposure][:, None, None]
+    sample.stamps.base *= factor
+    sample.stamps.slope *= factor
+    strongest = max(filter(None, sample.correlations),
+                    key=lambda one: sum(one.nearest))
+    warnings.warn(f'{strongest} The errors of pixels are taken to be '
+                  f'{np.sqrt(sample.growth.max()):.2f} times as large.',
+                  AstropyUserWarning, stacklevel=3)
 
 
 def _check_light(stamps):
@@ -218,7 +262,6 @@ def _usable_stamps(pixels, sources, radius, gain):
 
 def _estimate_noise(stamps, data):
     """Set the variance to that of the image away from stars, in place."""
-    from astropy.stats import mad_std
     stamps.base[:] = max(mad_std(data, ignore_nan=True) ** 2,
                          np.finfo(float).tiny)
 

@@ -19,6 +19,7 @@ from astropy.table import QTable
 
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import Field, lattice
+from photutils_mgauss.field.covariance import psf_errors
 from photutils_mgauss.field.forms import convolved, mixture_arrays
 from photutils_mgauss.field.input import normalised
 from photutils_mgauss.files.storage import storable, table_columns
@@ -58,7 +59,8 @@ class MixtureField(Field):
     covariance : (N, N) `~numpy.ndarray`
         The covariance of the N = (6 K - 3) T fitted coefficients, shape by
         shape and term by term within a shape. The first three shapes of the
-        first Gaussian are not fitted.
+        first Gaussian are not fitted. What ``unmodelled`` does to the stars
+        that were fitted is in it.
     stars : `~astropy.table.QTable`
         The stars, those that were dropped included: ``x``, ``y``, ``x_fit``,
         ``y_fit``, ``flux_fit``, ``local_bkg``, ``reduced_chi2``,
@@ -85,6 +87,9 @@ class MixtureField(Field):
     pixel_integrated : bool, optional
         Whether the mixtures are those of the optics, to be integrated over
         pixels. By default they contain the pixel and are sampled.
+    unmodelled : (6 K - 3,) `~numpy.ndarray`, optional
+        The variances of the shapes about their polynomials, such as stars
+        left out of the fit ask for; by default none.
 
     Examples
     --------
@@ -118,6 +123,7 @@ class MixtureField(Field):
     exposures: QTable = field(default=None)
     centre_stddev: float = np.inf
     pixel_integrated: bool = False
+    unmodelled: np.ndarray = None
 
     def __repr__(self):
         return self._described(f'n_components={self.n_components}, ')
@@ -139,6 +145,8 @@ class MixtureField(Field):
                 'stars': stars, 'dropped': table_columns(dropped)}
         if self.exposures is not None:
             tables['exposures'] = table_columns(self.exposures)
+        if self.unmodelled is not None:
+            tables['unmodelled'] = {'variance': self.unmodelled}
         return tables
 
     @classmethod
@@ -159,7 +167,8 @@ class MixtureField(Field):
                    float(detector['radius'][0]), covariance.reshape(n, n),
                    QTable(stars), residual, float(detector['accuracy'][0]),
                    QTable(tables['dropped']), exposures=exposures,
-                   centre_stddev=stddev, pixel_integrated=integrated)
+                   centre_stddev=stddev, pixel_integrated=integrated,
+                   unmodelled=tables.get('unmodelled', {}).get('variance'))
 
     @property
     def n_components(self):
@@ -192,13 +201,44 @@ class MixtureField(Field):
         weights, means, covariances, _ = self._mixtures([x], [y], exposure)
         return GaussianMixture(weights[0], means[0], covariances[0])
 
-    def _mixtures(self, x, y, exposure):
+    def _mixtures(self, x, y, exposure, change=None):
         """Return stacked weights, means, covariances and shifts."""
-        basis = stages.polynomials(*normalised(x, y, self.shape), self.degree)
-        shapes = np.einsum('nt,tki->nki', basis, self.coefficients)
+        shapes = np.einsum('nt,tki->nki', self._basis(x, y),
+                           self.coefficients)
+        if change is not None:
+            shapes.reshape(len(shapes), -1)[:, 3:] += change
         if exposure is not None:
             shapes = convolved(shapes, self._blur(exposure))
         return mixture_arrays(shapes, self.centre_stddev)
+
+    def _basis(self, x, y):
+        return stages.polynomials(*normalised(x, y, self.shape), self.degree)
+
+    def psf_errors(self, *, exposure=None):
+        """
+        Return how far the PSF may be off, for what is measured with it.
+
+        The errors of the coefficients, and what the shapes do beyond the
+        polynomials, around places all over the detector. `to_grid` hands
+        them on.
+
+        Parameters
+        ----------
+        exposure : int, optional
+            The exposure, from 0; by default the mean of all.
+
+        Returns
+        -------
+        PSFErrors
+        """
+        unmodelled = self.unmodelled
+        if unmodelled is None:
+            unmodelled = np.zeros(6 * self.n_components - 3)
+        return psf_errors(
+            lambda x, y, change: (self._basis(x, y), *self._mixtures(
+                x, y, exposure, change)[:3]),
+            self.covariance, unmodelled, self.degree, self.shape,
+            self.pixel_integrated)
 
     def _blur(self, exposure):
         n = 1 if self.exposures is None else len(self.exposures)
@@ -225,6 +265,7 @@ class MixtureField(Field):
         Returns
         -------
         GriddedMixturePSF
+            It knows the errors of the field.
 
         Raises
         ------
@@ -236,4 +277,5 @@ class MixtureField(Field):
         mixtures = [GaussianMixture(*one) for one in zip(*arrays,
                                                          strict=True)]
         return GriddedMixturePSF(mixtures, np.column_stack([x, y]),
-                                 pixel_integrated=self.pixel_integrated)
+                                 pixel_integrated=self.pixel_integrated,
+                                 errors=self.psf_errors(exposure=exposure))

@@ -21,6 +21,7 @@ from astropy.table import QTable
 
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import Field, lattice
+from photutils_mgauss.field.covariance import psf_errors
 from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.input import normalised
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
@@ -54,6 +55,9 @@ class TunedMixtureField(Field):
         Of the coefficients, change by change and term by term within one.
     centre_stddev, pixel_integrated
         As in `MixtureField`.
+    unmodelled : (6,) `~numpy.ndarray`, optional
+        The variances of the changes about their polynomials, such as stars
+        left out of the fit ask for; by default none.
 
     Examples
     --------
@@ -85,6 +89,7 @@ class TunedMixtureField(Field):
     dropped: QTable = field(default=None)
     centre_stddev: float = np.inf
     pixel_integrated: bool = False
+    unmodelled: np.ndarray = None
 
     def __repr__(self):
         return self._described()
@@ -103,7 +108,8 @@ class TunedMixtureField(Field):
         (6,) `~numpy.ndarray`
             In the order of ``coefficients``.
         """
-        return (self._basis(x, y) @ self.coefficients)[0]
+        x, y = as_real(x, 'x'), as_real(y, 'y')
+        return (self._basis([x], [y]) @ self.coefficients)[0]
 
     def convolution_at(self, x, y):
         """
@@ -123,9 +129,7 @@ class TunedMixtureField(Field):
         return np.array([[xx, xy], [xy, yy]])
 
     def _basis(self, x, y):
-        x, y = as_real(x, 'x'), as_real(y, 'y')
-        return stages.polynomials(*normalised([x], [y], self.shape),
-                                  self.degree)
+        return stages.polynomials(*normalised(x, y, self.shape), self.degree)
 
     def mixture_at(self, x, y):
         """
@@ -142,13 +146,45 @@ class TunedMixtureField(Field):
             Of as many Gaussians as ``start`` has there. It contains the
             pixel, unless the field is ``pixel_integrated``.
         """
+        x, y = as_real(x, 'x'), as_real(y, 'y')
         known = known_shapes(self.start, [x], [y], self.pixel_integrated)
-        shapes, sign = TunedShapes().shapes(
-            self.coefficients, self._basis(x, y), known)
+        return GaussianMixture(*(array[0] for array in self._mixtures(
+            [x], [y], known)))
+
+    def _mixtures(self, x, y, known, change=0.0):
+        """Return stacked weights, means and covariances."""
+        numbers = self._basis(x, y) @ self.coefficients + change
+        # The numbers are their own coefficients, star by star.
+        shapes, sign = TunedShapes().shapes(numbers, np.eye(len(numbers)),
+                                            known)
         shift = TunedShapes.shifts(shapes, sign, known, self.centre_stddev)
-        return GaussianMixture(sign[0] * np.exp(shapes[0, :, 0]),
-                               shapes[0, :, 1:3] + shift,
-                               covariances_of_logs(shapes[0]))
+        return (sign * np.exp(shapes[..., 0]),
+                shapes[..., 1:3] + shift[:, None],
+                covariances_of_logs(shapes))
+
+    def psf_errors(self):
+        """
+        Return how far the PSF may be off, for what is measured with it.
+
+        Returns
+        -------
+        PSFErrors
+            What the changes may be off; ``start`` counts as exact.
+        """
+        known = {}
+
+        def at(x, y, change):
+            if not known:
+                known['there'] = known_shapes(self.start, x, y,
+                                              self.pixel_integrated)
+            return (self._basis(x, y), *self._mixtures(
+                x, y, known['there'], change))
+
+        unmodelled = self.unmodelled
+        if unmodelled is None:
+            unmodelled = np.zeros(self.coefficients.shape[1])
+        return psf_errors(at, self.covariance, unmodelled, self.degree,
+                          self.shape, self.pixel_integrated)
 
     def to_grid(self, grid_shape=None):
         """
@@ -178,7 +214,8 @@ class TunedMixtureField(Field):
         return GriddedMixturePSF(
             [self.mixture_at(*place) for place in places], places,
             scales=[float(scale_at(*place)) for place in places],
-            pixel_integrated=self.pixel_integrated)
+            pixel_integrated=self.pixel_integrated,
+            errors=self.psf_errors())
 
 
 def known_shapes(start, x, y, integrated):

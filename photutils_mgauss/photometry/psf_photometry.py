@@ -21,8 +21,10 @@ from photutils.psf import PSFPhotometry
 
 from photutils_mgauss.photometry import engine
 from photutils_mgauss.photometry import table as _table
+from photutils_mgauss.photometry.errors import with_all_errors
 from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
 from photutils_mgauss.utils import compat
+from photutils_mgauss.utils.correlated_noise import noise_correlation
 from photutils_mgauss.utils.image import read_pixels, with_unit
 from photutils_mgauss.utils.per_thread import PerThread, keep
 from photutils_mgauss.utils.star_columns import plain_values
@@ -74,6 +76,16 @@ class MixturePSFPhotometry(PSFPhotometry):
     xy_cov : bool, optional
         Whether to add the column ``xy_cov``, the covariance of ``x_fit`` and
         ``y_fit`` [pix^2].
+    psf_errors : bool, optional
+        Whether the errors contain what the PSF may be off, if ``psf_model``
+        knows that, as a `MixtureField` and its grid do. That part is also
+        in columns of its own, ``x_psf_err``, ``y_psf_err`` [pix] and
+        ``flux_psf_err``: it is common to stars that are near each other.
+    correlated_noise : bool, optional
+        Whether to look, on blank sky, if the noise of neighbouring pixels is
+        correlated, as in resampled images, and to enlarge the errors for
+        that. What was found is in ``meta['noise_correlation']`` of the
+        table, and a warning tells it. Only used with ``error``.
     aperture_radius_correction : float, optional
         If given, adds the column ``aperture_correction``: what to multiply a
         flux measured within this radius [pix] by, the inverse of the PSF's
@@ -126,7 +138,8 @@ class MixturePSFPhotometry(PSFPhotometry):
 
     def __init__(self, psf_model, fit_shape, *, fitter=None, executor=None,
                  n_threads=None, fit_sky=False, effective_gain=None,
-                 variance='model', xy_cov=False,
+                 variance='model', xy_cov=False, psf_errors=True,
+                 correlated_noise=True,
                  aperture_radius_correction=None, **kwargs):
         fitter = MixtureFitter() if fitter is None else fitter
         if n_threads is not None and compat.HAS_THREADS:
@@ -140,7 +153,9 @@ class MixturePSFPhotometry(PSFPhotometry):
                    'executor has its own number of threads')
             raise ValueError(msg)
         self.executor = executor
-        self._told_of_photutils = False
+        self._told_of_photutils = self._told_of_correlation = False
+        self.psf_errors = bool(psf_errors)
+        self.correlated_noise = bool(correlated_noise)
         self.fit_sky = bool(fit_sky)
         self.effective_gain = (
             None if effective_gain is None
@@ -183,11 +198,13 @@ class MixturePSFPhotometry(PSFPhotometry):
             compat.check_nddata(mask, error)
         call = compat.for_one_call(self)
         try:
-            return call._measure(read_pixels(data, error, mask), init_params)
+            table = call._measure(read_pixels(data, error, mask), init_params)
         finally:
             keep(self, **{name: getattr(call, name)
                           for name in compat.OF_A_CALL if name != 'fit_info'},
                  _fit_info=call._fit_info)
+        self._tell_of_correlation()
+        return table
 
     def _measure(self, pixels, init_params):
         """Do what a call does; changes this object."""
@@ -205,10 +222,35 @@ class MixturePSFPhotometry(PSFPhotometry):
         self.init_params = init_params
         image = self._make_image(data, mask, error)
         result, group_size = self._fit(image, init_params)
+        correlation = self._correlation(image, result)
+        result, psf_part = with_all_errors(
+            result, image, self.psf_model, self.fit_shape,
+            psf_errors=self.psf_errors, correlation=correlation,
+            fit_sky=self.fit_sky, executor=self.executor,
+            n_threads=self._n_threads)
         self.results = self._make_table(result, group_size, data.shape,
-                                        error is not None)
+                                        error is not None, psf_part)
+        self.results.meta['noise_correlation'] = (
+            '' if correlation is None else str(correlation))
         self._warn_of_failures(result)
         return self.results
+
+    def _correlation(self, image, result):
+        """Return the correlation of the noise if it counts."""
+        if not self.correlated_noise:
+            return None
+        return noise_correlation(image.data, image.error, image.mask,
+                                 *result.values[:, 1:].T,
+                                 max(self.fit_shape) / 2 + 3)
+
+    def _tell_of_correlation(self):
+        """Warn once that noise is correlated."""
+        found = (self.results is not None and self.results.meta.get(
+            'noise_correlation'))
+        if found and not self._told_of_correlation:
+            self._told_of_correlation = True
+            warnings.warn(f'{found} Errors are enlarged for it.',
+                          AstropyUserWarning, stacklevel=3)
 
     @property
     def fit_info(self):
@@ -307,13 +349,15 @@ class MixturePSFPhotometry(PSFPhotometry):
         _check_errors(fits, stars)
         return start.result(rows, fits), counts[inverse]
 
-    def _make_table(self, result, group_size, data_shape, has_error):
+    def _make_table(self, result, group_size, data_shape, has_error,
+                    psf_part):
         has_error = has_error or self.effective_gain is not None
         quality = _table.fit_quality(result, np.count_nonzero(self._free),
                                      has_error)
         flags = _table.define_flags(result, self.fit_shape, data_shape)
         columns = _table.make_columns(result, quality, flags, self.data_unit)
         columns |= self._extra_columns(result)
+        columns |= _table.psf_columns(psf_part, self.data_unit)
         table, rows = _table.assemble(self.init_params, group_size, columns,
                                       compat.results_meta(self))
         self.fit_info = _table.FitInfo(result, rows)

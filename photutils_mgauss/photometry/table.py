@@ -7,6 +7,7 @@ import numpy as np
 from photutils_mgauss.photometry.engine import CONVERGED
 from photutils_mgauss.photometry.fitter import MESSAGES
 from photutils_mgauss.utils import compat
+from photutils_mgauss.utils.image import with_unit
 
 # Bits of the ``flags`` column, see `decode_psf_flags`.
 PARTIAL = 1
@@ -208,6 +209,15 @@ def make_columns(result, quality, flags, unit):
     columns['qfit'], columns['cfit'], columns['reduced_chi2'] = quality
     columns['flags'] = flags
     return columns
+
+
+def psf_columns(covariances, unit):
+    """Return the columns of the PSF's part of the errors, if it is known."""
+    if covariances is None:
+        return {}
+    flux, x, y = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)).T
+    return {'x_psf_err': x, 'y_psf_err': y,
+            'flux_psf_err': with_unit(flux, unit)}
 
 
 def assemble(init_params, group_size, columns, meta):

@@ -25,6 +25,7 @@ from photutils_mgauss.psf.base import (
     with_unit,
 )
 from photutils_mgauss.psf.convert import GridConversions
+from photutils_mgauss.psf.errors import PSFErrors
 from photutils_mgauss.psf.grid import checked_arrays, make_grid, plain_report
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.model import MultiGaussianPSFModel
@@ -90,6 +91,9 @@ class GriddedMixturePSF(GridConversions, PSFModel):
         What a star outside the outermost nodes gets: the PSF of the nearest
         edge, a ValueError, or NaN. Leave it at ``'clamp'`` for fits, which
         may step anywhere.
+    errors : PSFErrors, optional
+        How far the PSF may be off, as ``MixtureField.psf_errors`` knows it.
+        Photometry adds it to the errors of stars.
     **kwargs
         Keywords of `~astropy.modeling.Model`: ``name``, ``meta``, ``fixed``,
         ``bounds``.
@@ -122,18 +126,23 @@ n_components=1)>
 
     def __init__(self, mixtures, grid_xypos, *, flux=1, x_0=0, y_0=0,
                  pixel_integrated=False, scales=None, interpolation='blend',
-                 outside='clamp', **kwargs):
+                 outside='clamp', errors=None, **kwargs):
         mixtures = list(mixtures)
         grid, order = make_grid(mixtures, grid_xypos, scales)
-        self._set_up(grid, pixel_integrated, interpolation, outside)
+        self._set_up(grid, pixel_integrated, interpolation, outside, errors)
         self._report = plain_report(
             grid.positions, (grid.weights != 0).sum(axis=1), grid.scales)
         self._report['bridged'] = [mixtures[i] is None for i in order]
         super().__init__(flux=flux, x_0=x_0, y_0=y_0, **kwargs)
         self._finish()
 
-    def _set_up(self, grid, pixel_integrated, interpolation, outside):
+    def _set_up(self, grid, pixel_integrated, interpolation, outside,
+                errors):
         self._grid = grid
+        if not (errors is None or isinstance(errors, PSFErrors)):
+            msg = f'errors must be PSFErrors or None, got {errors!r:.80}'
+            raise TypeError(msg)
+        self._errors = errors
         self._pixel_integrated = bool(pixel_integrated)
         self._interpolation = as_choice(interpolation, 'interpolation',
                                         tuple(_KERNELS))
@@ -145,10 +154,11 @@ n_components=1)>
 
     @classmethod
     def _of_grid(cls, grid, report=None, *, pixel_integrated=False,
-                   interpolation='blend', outside='clamp', **kwargs):
+                   interpolation='blend', outside='clamp', errors=None,
+                   **kwargs):
         """Return a model of a grid that needs no checks."""
         new = cls.__new__(cls)
-        new._set_up(grid, pixel_integrated, interpolation, outside)
+        new._set_up(grid, pixel_integrated, interpolation, outside, errors)
         new._report = report if report is not None else plain_report(
             grid.positions, (grid.weights != 0).sum(axis=1), grid.scales)
         PSFModel.__init__(new, **kwargs)
@@ -202,6 +212,11 @@ n_components=1)>
     def n_components(self):
         """The largest number K of Gaussians of a node."""
         return self._grid.weights.shape[1]
+
+    @property
+    def errors(self):
+        """How far the PSF may be off, or None if that is not known."""
+        return self._errors
 
     @property
     def interpolation(self):
@@ -386,11 +401,13 @@ n_components=1)>
         GriddedMixturePSF
         """
         mixtures = [mixture.convolve(kernel) for mixture in self.mixtures]
+        errors = self._errors and self._errors.convolved(kernel)
         new = GriddedMixturePSF(
             mixtures, self.grid_xypos, flux=self.flux.value,
             x_0=self.x_0.value, y_0=self.y_0.value, scales=self.scales,
             pixel_integrated=self._pixel_integrated,
-            interpolation=self._interpolation, outside=self._outside)
+            interpolation=self._interpolation, outside=self._outside,
+            errors=errors)
         new._report['bridged'] = self._report['bridged']
         return new
 
@@ -441,8 +458,11 @@ n_components=1)>
                  'outside': [self._outside]}
         nodes = {'x': x, 'y': y, 'scale': grid.scales, 'weight': grid.weights,
                  'mean': grid.means, 'covariance': grid.covariances}
-        return {'model': model, 'parameters': self._parameter_table(),
-                'nodes': nodes, 'report': table_columns(self._report)}
+        tables = {'model': model, 'parameters': self._parameter_table(),
+                  'nodes': nodes, 'report': table_columns(self._report)}
+        if self._errors is not None:
+            tables['psf_errors'] = self._errors.to_columns()
+        return tables
 
     @classmethod
     def _from_tables(cls, tables):
@@ -453,11 +473,13 @@ n_components=1)>
             nodes['mean'].reshape(n, -1, 2),
             nodes['covariance'].reshape(n, -1, 2, 2), nodes['scale'])
         report = tables.get('report')
+        errors = tables.get('psf_errors')
         return cls._of_grid(
             grid, QTable(report) if report else None,
             pixel_integrated=model['pixel_integrated'][0],
             interpolation=str(model['interpolation'][0]),
             outside=str(model['outside'][0]),
+            errors=PSFErrors.from_columns(errors) if errors else None,
             name=str(model['name'][0]) or None,
             **cls._parameter_keywords(tables['parameters']))
 

@@ -1,0 +1,276 @@
+r"""
+How far a field may be off, and what it does to a PSF at one place.
+
+The inverse of the normal equations is the covariance of the coefficients if
+the PSF of every star is the polynomial. Where few stars allow only a low
+degree it is not: the shapes of star s deviate by numbers of a covariance
+:math:`\tau^2 S`, with S the variances by which shapes vary over the detector,
+as the prior has learnt them. Stars left out of the fit show it. With the
+equations :math:`A_s, b_s` of star s, at the fit to all of them and its own
+numbers eliminated, and M those of the whole field, prior included, the
+gradient of star s at the field fitted to the others is
+
+.. math::
+
+    g_s = b_s + A_s V_s b_s, \quad
+    V_s = B_s^T (M - A_s \otimes B_s B_s^T)^{-1} B_s ,
+
+and is drawn from a Gaussian of covariance
+
+.. math::
+
+    A_s + A_s \left(V_s + \tau^2 S + \tau^2 U_s\right) A_s ,
+
+where :math:`\tau^2 U_s` is what the deviations of the others do to the field
+at star s. The most likely :math:`\tau^2` is taken.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from photutils_mgauss.field.base import covariance_of, lattice
+from photutils_mgauss.field.normal import Workers, equations, to_vector
+from photutils_mgauss.psf.errors import PSFErrors, responses
+from photutils_mgauss.psf.grid import Grid
+
+# Stars that are left out in turn, at most.
+_MOST_STARS = 150
+# With fewer, nothing is known of how the others predict one.
+_FEWEST_STARS = 3
+# Between what tau^2 is looked for, and by how much it must make the stars
+# more likely, in 2 log(likelihood).
+_RANGE = (1e-5, 1e3)
+_GAIN = 1.0
+# How many directions the errors at a place have. Positions and fluxes of
+# bright and of faint stars, in small and in large stamps, need no more.
+_DIRECTIONS = 6
+# The stamps and the backgrounds, as a share of the peak, of those stars.
+_HALF_SIZES = (2, 5)
+_BACKGROUNDS = (1e-3, 10.0)
+# Steps of numerical derivatives.
+_STEP = 1e-4
+
+
+def honest_covariance(fit):
+    """
+    Return the covariance of the coefficients and what is not modelled.
+
+    Parameters
+    ----------
+    fit : FieldFit
+
+    Returns
+    -------
+    covariance : (N, N) `~numpy.ndarray`
+        What the stars' deviations from the polynomials add is included.
+    unmodelled : (P,) `~numpy.ndarray`
+        The variances of the P shapes about their polynomials.
+    """
+    covariance = covariance_of(fit)
+    scale = _variation(fit)
+    used = np.flatnonzero(fit.problem.used)
+    if used.size < _FEWEST_STARS:
+        return covariance, np.zeros(scale.size)
+    some = used[np.linspace(0, used.size - 1, min(
+        used.size, _MOST_STARS)).astype(int)]
+    stars = _left_out(fit, covariance, some)
+    spread = sum(np.kron((star.matrix * scale) @ star.matrix,
+                         np.outer(star.basis, star.basis)) for star in stars)
+    spread *= used.size / some.size
+    share = _most_likely([star.whitened(scale, spread) for star in stars])
+    added = covariance @ spread @ covariance
+    return covariance + share * added, share * scale
+
+
+def _variation(fit):
+    """Return the variances (P,) by which shapes vary over the field."""
+    variance = 1 / to_vector(fit.prior.precision).reshape(
+        -1, len(fit.coefficients))
+    # Without terms of degree 1 the ratios of the constants must do.
+    return variance[:, 1:3].mean(axis=1) if len(
+        fit.coefficients) > 1 else variance[:, 0]
+
+
+@dataclass
+class _LeftOut:
+    """
+    A star left out of the fit.
+
+    Attributes
+    ----------
+    matrix, gradient : (P, P), (P,) `~numpy.ndarray`
+        Its own equations at the fit to the others.
+    basis : (T,) `~numpy.ndarray`
+    to_others : (N, P) `~numpy.ndarray`
+        The covariance of the coefficients and the shapes at the star.
+    prediction : (P, P) `~numpy.ndarray`
+        The covariance of the shapes that the others predict.
+    """
+
+    matrix: np.ndarray
+    gradient: np.ndarray
+    basis: np.ndarray
+    to_others: np.ndarray
+    prediction: np.ndarray
+
+    def whitened(self, scale, spread):
+        """
+        Return gradient, expected excess of it, and that for tau^2 = 1.
+
+        In units in which the star's own noise is a unit matrix.
+        """
+        values, vectors = np.linalg.eigh(self.matrix)
+        seen = values > 1e-10 * values.max()
+        root = np.sqrt(values[seen])
+        vectors = vectors[:, seen]
+        own = np.einsum('ptq,t->pq', self.to_others.reshape(
+            scale.size, -1, scale.size), self.basis) @ self.matrix
+        others = (self.to_others.T @ spread @ self.to_others
+                  - own * scale @ own.T)
+        unmodelled = others + np.diag(scale)
+        return (vectors.T @ self.gradient / root,
+                *(root[:, None] * (vectors.T @ one @ vectors) * root
+                  for one in (self.prediction, unmodelled)))
+
+
+def _left_out(fit, covariance, stars):
+    """Return the stars as they look to the fit to all others."""
+    found = []
+    with Workers() as workers:
+        for star in stars:
+            basis = fit.problem.basis[star]
+            matrix, gradient = _own_equations(fit, star, workers)
+            size = len(matrix)
+            # M^-1 B, and without this star by Woodbury's identity.
+            towards = covariance.reshape(-1, size, basis.size) @ basis
+            here = np.einsum('ptq,t->pq', towards.reshape(
+                size, basis.size, size), basis)
+            without = np.linalg.inv(np.eye(size) - matrix @ here)
+            prediction = here @ without
+            found.append(_LeftOut(
+                matrix, gradient + matrix @ (prediction @ gradient), basis,
+                towards @ without, (prediction + prediction.T) / 2))
+    return found
+
+
+def _own_equations(fit, star, workers):
+    """Return the equations of the shapes at one star, from its pixels."""
+    problem = fit.problem.subset(np.array([star]))
+    shapes = np.tensordot(problem.basis, fit.coefficients, 1)
+    problem.basis = np.ones((1, 1))
+    found = equations(problem, shapes, workers)
+    return found.matrix, found.right
+
+
+def _most_likely(stars):
+    """Return the tau^2 under which the left-out stars are most likely."""
+    def cost(share):
+        total = 0
+        for gradient, expected, unmodelled in stars:
+            values, vectors = np.linalg.eigh(
+                np.eye(gradient.size) + expected + share * unmodelled)
+            values = np.maximum(values, 1e-3)
+            total += np.sum(np.log(values)
+                            + (vectors.T @ gradient) ** 2 / values)
+        return total
+
+    best = minimize_scalar(lambda log: cost(np.exp(log)),
+                           bounds=np.log(_RANGE), method='bounded',
+                           options={'xatol': 0.1})
+    return np.exp(best.x) if cost(0.0) - best.fun > _GAIN else 0.0
+
+
+def shape_covariance(covariance, unmodelled, basis):
+    """
+    Return the covariance of the shapes at places.
+
+    Parameters
+    ----------
+    covariance : (P T, P T) `~numpy.ndarray`
+    unmodelled : (P,) `~numpy.ndarray`
+    basis : (n, T) `~numpy.ndarray`
+
+    Returns
+    -------
+    (n, P, P) `~numpy.ndarray`
+    """
+    n_terms = basis.shape[1]
+    size = len(covariance) // n_terms
+    blocks = covariance.reshape(size, n_terms, size, n_terms)
+    half = np.einsum('ptqu,nu->nptq', blocks, basis)
+    return np.einsum('nptq,nt->npq', half, basis) + np.diag(unmodelled)
+
+
+def psf_errors(at, covariance, unmodelled, degree, shape, integrated):
+    """
+    Return the errors of a field's PSF.
+
+    Parameters
+    ----------
+    at : callable
+        ``at(x, y, change)`` returns the polynomials (n, T), weights, means
+        and covariances at places (n,), with P numbers added to the shapes.
+    covariance, unmodelled : (N, N), (P,) `~numpy.ndarray`
+    degree : int
+    shape : (int, int)
+        Of the detector.
+    integrated : bool
+        Whether the mixtures are to be integrated over pixels.
+
+    Returns
+    -------
+    PSFErrors
+    """
+    # The covariance is a polynomial of twice the degree.
+    n = max(2 * degree + 1, 5) if degree else 1
+    n_nodes = tuple(min(n, size) for size in shape)
+    x, y = lattice(n_nodes, shape)
+    zero = np.zeros(unmodelled.size)
+    basis, *mixtures = at(x, y, zero)
+    every = np.stack([_slopes(at, x, y, step) for step in
+                      _STEP * np.eye(unmodelled.size)], axis=1)
+    grid = Grid(np.unique(x), np.unique(y), *mixtures, np.ones(x.size))
+    found = shape_covariance(covariance, unmodelled, basis)
+    return PSFErrors(grid, _directions(PSFErrors(grid, every), found,
+                                       integrated))
+
+
+def _slopes(at, x, y, step):
+    """Return the changes (n, K, 6) of the mixtures by one of the shapes."""
+    weight, mean, covariance = (
+        (after - before) / (2 * step.sum()) for after, before in zip(
+            at(x, y, step)[1:], at(x, y, -step)[1:], strict=True))
+    return np.concatenate([weight[..., None], mean, covariance[..., 0, :],
+                           covariance[..., 1, 1:]], axis=-1)
+
+
+def _directions(every, covariance, integrated):
+    """
+    Return the few changes that matter to stars, (n, R, K, 6).
+
+    Those that shift positions and fluxes most, each kind of star in units of
+    its own standard deviation.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0))[:, None]
+    kinds = np.concatenate([
+        _shifts(every, half, background, integrated) for half in _HALF_SIZES
+        for background in _BACKGROUNDS], axis=1) @ root
+    size = np.sqrt((kinds**2).sum(axis=2, keepdims=True))
+    _, _, right = np.linalg.svd(
+        np.divide(kinds, size, where=size > 0, out=np.zeros_like(kinds)),
+        full_matrices=False)
+    kept = right[:, :_DIRECTIONS] @ root.transpose(0, 2, 1)
+    return np.einsum('nrp,npki->nrki', kept, every.changes)
+
+
+def _shifts(every, half, background, integrated):
+    """Return the shifts (n, 3, P) of stars by each change of the PSF."""
+    middle = np.zeros(len(every.changes))
+    images = every.images(np.arange(middle.size), middle, middle,
+                          (2 * half + 1, 2 * half + 1),
+                          integrated=integrated)
+    light = np.maximum(images[:, 0], 0)
+    weight = 1 / (light + background * light.max(axis=1, keepdims=True))
+    return responses(images[:, :3], weight, images[:, 3:])[0]

@@ -1,0 +1,212 @@
+r"""
+The correlation of the noise of neighbouring pixels, from blank sky.
+
+Resampling an image (drizzling, reprojecting, shifting by parts of a pixel)
+spreads the noise of each pixel over its neighbours. Pulls d of blank pixels,
+data over errors, then have products :math:`\langle d_i d_{i + \Delta}
+\rangle` other than zero at short distances. Faint light and an uneven sky have
+them as well, but as large at long ones: the mean of those at the longest is
+subtracted from all.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.stats import mad_std
+from scipy.ndimage import (
+    binary_dilation,
+    maximum_filter,
+    minimum_filter,
+    uniform_filter,
+)
+
+# The largest distance along an axis [pix].
+_REACH = 5
+# Squares that are looked at: their number and their side [pix]; few at first,
+# and more if noise seems to be correlated there.
+_FIRST, _ALL = (6, 64), (12, 96)
+# With fewer pairs of pixels nothing is said.
+_FEWEST_PAIRS = 2000
+# Means over squares of these sides [pix] beyond this many standard deviations,
+# and pixels around them, are light that nobody has listed.
+_SIDES, _LIGHT = (1, 3, 7), 3.5
+# A correlation counts if it is beyond so many of its standard errors, and the
+# mean one of the nearest pixels is so large: 0.02 makes an error 4 % larger.
+_SIGNIFICANT, _LEAST = 5.0, 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseCorrelation:
+    """
+    The correlation of the noise of pixels.
+
+    Attributes
+    ----------
+    matrix : (2 m + 1, 2 m + 1) `~numpy.ndarray`
+        The correlation of two pixels at each distance (y, x), 1 in the
+        middle. Where blank sky scatters less than its errors say, all but
+        the middle is smaller by the square of that.
+    scatter : float
+        The scatter of blank sky in units of its errors.
+    """
+
+    matrix: np.ndarray
+    scatter: float
+
+    @property
+    def nearest(self):
+        """The correlations with the next pixel along x and y."""
+        return tuple(float(self.matrix[_REACH + dy, _REACH + dx])
+                     for dy, dx in ((0, 1), (1, 0)))
+
+    def growth(self, width):
+        """
+        Return by how much the variance of a star's position grows.
+
+        Parameters
+        ----------
+        width : float
+            The standard deviation of the PSF [pix].
+
+        Returns
+        -------
+        float
+            For a Gaussian among pixels of one error, the sum of the
+            correlations times the overlap of the star's derivative with
+            itself at each distance.
+        """
+        steps = np.arange(-_REACH, _REACH + 1)
+        square = (steps**2 + steps[:, None]**2) / (4 * width**2)
+        overlap = (1 - square) * np.exp(-square)
+        return max(1.0, float((self.matrix * overlap).sum()))
+
+    def __str__(self):
+        along_x, along_y = self.nearest
+        return ('The noise of neighbouring pixels is correlated, as in '
+                f'resampled images: by {along_x:.2f} along x and '
+                f'{along_y:.2f} along y, measured on blank sky.')
+
+
+def noise_correlation(data, error, mask, x, y, margin):
+    """
+    Measure the correlation of the noise on blank sky.
+
+    Parameters
+    ----------
+    data, error : (ny, nx) `~numpy.ndarray`
+        Without errors, an empty array, nothing is found.
+    mask : (ny, nx) `~numpy.ndarray` of bool
+        True for pixels to leave out; may be empty.
+    x, y : (n,) `~numpy.ndarray`
+        Known stars.
+    margin : float
+        How far around them pixels are not blank [pix].
+
+    Returns
+    -------
+    NoiseCorrelation or None
+        None if there is none that is significant.
+    """
+    if not error.size:
+        return None
+    image = data, error, mask
+    finite = np.isfinite(x) & np.isfinite(y)
+    x, y = x[finite], y[finite]
+    stars = x, y, margin
+    if _in_squares(image, stars, *_FIRST) is None:
+        return None
+    return _in_squares(image, stars, *_ALL)
+
+
+def _in_squares(image, stars, number, side):
+    """Return the correlation in some squares, or None."""
+    size = 2 * _REACH + 1
+    products, pairs = np.zeros((size, size)), np.zeros((size, size))
+    for rows, columns in _squares(image[0].shape, number, side):
+        _add_products(_blank_pulls(image, rows, columns, *stars), products,
+                      pairs)
+    if pairs.min() < _FEWEST_PAIRS:
+        return None
+    matrix = np.divide(products, pairs, where=pairs > 0,
+                       out=np.zeros_like(products))
+    ring = np.ones(matrix.shape, bool)
+    ring[1:-1, 1:-1] = False
+    matrix -= matrix[ring].mean()
+    variance = matrix[_REACH, _REACH]
+    if variance <= 0:
+        return None
+    matrix /= variance
+    # Blank sky that scatters less than its errors has them from the time
+    # before the image was resampled, and errors are right already.
+    matrix *= min(variance, 1)
+    matrix[_REACH, _REACH] = 1
+    # Pairs are correlated with each other, if pixels are.
+    deviation = np.sqrt((matrix**2).sum() / pairs)
+    near = [matrix[_REACH, _REACH + 1], matrix[_REACH + 1, _REACH]]
+    if not (np.mean(near) > _LEAST
+            and np.mean(near) > _SIGNIFICANT * deviation[_REACH, _REACH]):
+        return None
+    matrix[np.abs(matrix) < _SIGNIFICANT * deviation] = 0
+    return NoiseCorrelation(matrix, float(np.sqrt(variance)))
+
+
+def _squares(shape, number, side):
+    """Return slices of squares spread evenly over an image."""
+    columns = max(1, round(np.sqrt(number * shape[1] / shape[0])))
+    counts = (max(1, round(number / columns)), columns)
+    starts = [np.unique(np.linspace(0, max(size - side, 0), min(
+        count, -(-size // side))).astype(int))
+        for size, count in zip(shape, counts, strict=True)]
+    return [(slice(row, row + side), slice(column, column + side))
+            for row in starts[0] for column in starts[1]]
+
+
+def _blank_pulls(image, rows, columns, x, y, margin):
+    """Return data over errors of blank pixels less their median, else NaN."""
+    data, error = (array[rows, columns] for array in image[:2])
+    with np.errstate(invalid='ignore', divide='ignore'):
+        pulls = data / error
+    usable = np.isfinite(pulls) & (error > 0)
+    if image[2].size:
+        usable &= ~image[2][rows, columns]
+    # Padding: a value repeated all around is no noise.
+    usable &= (maximum_filter(data, 3) != minimum_filter(data, 3))
+    height, width = data.shape
+    near = ((x > columns.start - margin)
+            & (x < columns.start + width + margin)
+            & (y > rows.start - margin) & (y < rows.start + height + margin))
+    for x_0, y_0 in zip(x[near] - columns.start, y[near] - rows.start,
+                        strict=True):
+        box = tuple(slice(max(int(np.ceil(at - margin)), 0),
+                          max(int(at + margin) + 1, 0)) for at in (y_0, x_0))
+        usable[box] = False
+    pulls = np.where(usable, pulls, 0)
+    pulls -= np.median(pulls[usable]) if usable.any() else 0
+    for side in _SIDES:
+        if not usable.any():
+            break
+        mean = uniform_filter(pulls, side)
+        light = usable & (np.abs(mean) > _LIGHT * mad_std(mean[usable]))
+        usable &= ~binary_dilation(light, iterations=2 + side // 2)
+    pulls[~usable] = np.nan
+    return pulls - np.mean(pulls[usable]) if usable.any() else pulls
+
+
+def _add_products(pulls, products, pairs):
+    """Add the products of all pairs of pixels, and how many there are."""
+    good = np.isfinite(pulls)
+    values = np.where(good, pulls, 0)
+    good = good.astype(float)
+    height, width = values.shape
+    for dy in range(_REACH + 1):
+        for dx in range(-_REACH if dy else 0, _REACH + 1):
+            if dy >= height or abs(dx) >= width:
+                continue
+            one = (slice(0, height - dy),
+                   slice(max(-dx, 0), width - max(dx, 0)))
+            other = (slice(dy, height),
+                     slice(max(dx, 0), width - max(-dx, 0)))
+            for array, total in ((values, products), (good, pairs)):
+                found = np.vdot(array[one], array[other])
+                total[_REACH + dy, _REACH + dx] += found
+                if dy or dx:
+                    total[_REACH - dy, _REACH - dx] += found
