@@ -26,6 +26,10 @@ _THRESHOLDS = (40.0, 30.0, 20.0, 15.0, 12.0)
 # The radius of the stamps of the first passes [pix], while there are still
 # many faint stars in the wings.
 _RADII = (8.0, 12.0)
+# In these, too, the sky is a little too bright everywhere, by the light of
+# wings that are not yet in the PSF. Later it is known better from all stars
+# together than from one stamp, which cannot tell it from a wing.
+_OWN_SKY = 2
 # Residuals below this many times the PSF's relative error are not taken for
 # stars; the PSF is known no better than the least and no worse than the most.
 _CAUTION, _LEAST_ERROR, _MOST_ERROR = 2.0, 0.01, 0.3
@@ -283,7 +287,8 @@ def next_field(image, field, number, options, solve):
         solved.with_stars(psf, used), used, error=np.sqrt(solved.variance),
         n_components=options.n_components,
         degree=options.degree_of(number, len(used)),
-        radius=options.radius(number), local_bkg=True, effective_gain=np.inf)
+        radius=options.radius(number), local_bkg=number < _OWN_SKY,
+        effective_gain=np.inf)
     return _with_reasons(new, stars)
 
 
