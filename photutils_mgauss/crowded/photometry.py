@@ -163,6 +163,8 @@ class CrowdedMixturePhotometry:
     field : MixtureField or None
         The PSF that was made of the stars of the last image, if
         ``psf_model`` is None.
+    psf_used : GriddedMixturePSF or MultiGaussianPSFModel
+        The PSF of the last table, ``psf_model`` unless that is None.
 
     Raises
     ------
@@ -204,8 +206,8 @@ class CrowdedMixturePhotometry:
 
     results = PerThread('The table of the last call.')
     field = PerThread('The PSF made of the stars of the last image.')
+    psf_used = PerThread('The PSF of the last table.')
     _noise = PerThread('The noise of a pixel of the last image.')
-    _model = PerThread('The PSF of the last image.')
 
     def __init__(self, psf_model, *, threshold=4.5, keep=2.0, depth=3.5,
                  count_slope=1.5, background_size=64, psf_error=0.01,
@@ -241,7 +243,7 @@ class CrowdedMixturePhotometry:
         self._checkpoint = Checkpoint(checkpoint)
         self.results = self.field = None
         self._noise = np.inf
-        self._model = psf_model
+        self.psf_used = psf_model
         self._psf = None if psf_model is None else LocalPSF.of(psf_model)
 
     def __call__(self, data, *, mask=None, error=None, init_params=None):
@@ -301,7 +303,7 @@ class CrowdedMixturePhotometry:
         from photutils_mgauss.crowded.psf_loop import LoopOptions
         field, model = self.fit_field(image, LoopOptions(
             progress_bar=self.progress_bar))
-        keep(self, field=field, _model=model)
+        keep(self, field=field, psf_used=model)
         return LocalPSF.of(model)
 
     def fit_field(self, image, options):
@@ -437,7 +439,7 @@ class CrowdedMixturePhotometry:
         stars[2, (table['flags'] & REPEATED) > 0] = 0
         window = None if psf_shape is None else as_shape(psf_shape,
                                                          'psf_shape')
-        image = MixtureRenderer(self._model).image(
+        image = MixtureRenderer(self.psf_used).image(
             stars, _FAINTEST * self._noise, shape, window)
         if include_local_bkg and len(table):
             image += _nearest_background(table, shape)

@@ -12,7 +12,7 @@ import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, vstack
 from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss.crowded import psf_stars
@@ -20,6 +20,7 @@ from photutils_mgauss.field.base import lattice
 from photutils_mgauss.field.fit import fit_mixture_field
 from photutils_mgauss.field.stages import n_terms
 from photutils_mgauss.psf.renderer import MixtureRenderer
+from photutils_mgauss.utils.image import with_unit
 
 # The significance of the faintest stars of each pass; the last goes on.
 _THRESHOLDS = (40.0, 30.0, 20.0, 15.0, 12.0)
@@ -144,11 +145,9 @@ class Solved:
                                          image.gain, solve, options)
             residual[window] = np.where(before > 0, data - model, 0)
             variance[window] = _of_model(before, residual[window], image.gain)
-            for name, start in zip('xy', window[::-1], strict=True):
-                table[f'{name}_fit'] += start.start
-            tables.append(table)
+            tables.append(_in_image(table, window))
             noise.append(np.median(before[before > 0]))
-        return cls(_stacked(tables), residual, variance,
+        return cls(vstack(tables), residual, variance,
                    float(np.sqrt(np.median(noise))))
 
     def with_stars(self, psf, stars):
@@ -172,12 +171,17 @@ def _solve_window(data, variance, psf, gain, solve, options):
                                               include_local_bkg=True)
 
 
-def _stacked(tables):
-    """Return the rows of tables, ids and all, as they are."""
-    names = ('x_fit', 'y_fit', 'flux_fit', 'flux_err', 'crowding', 'flags')
-    return QTable({name: np.concatenate([np.asarray(one[name])
-                                         for one in tables])
-                   for name in names})
+def _in_image(table, window):
+    """Return stars in image pixels, with their distance to the border."""
+    out = {name: np.asarray(table[name])
+           for name in ('flux_fit', 'flux_err', 'crowding', 'flags')}
+    margin = np.full(len(table), np.inf)
+    for name, part in zip('xy', window[::-1], strict=True):
+        place = np.asarray(table[f'{name}_fit'])
+        out[f'{name}_fit'] = place + part.start
+        margin = np.minimum.reduce([
+            margin, place, part.stop - part.start - 1 - place])
+    return QTable(out | {'margin': margin})
 
 
 def _of_model(variance, residual, gain):
@@ -233,7 +237,17 @@ def fit_field(pixels, options, solve, effective_gain=None):
             stacklevel=4)
     if bar is not None:
         bar.close()
-    return field
+    return _with_unit(field, pixels.unit)
+
+
+def _with_unit(field, unit):
+    """Return the field with the unit of the image in its tables."""
+    stars, dropped = field.stars.copy(), field.dropped.copy()
+    for table, names in ((stars, ('flux_fit', 'local_bkg')),
+                         (dropped, ('flux',))):
+        for name in names:
+            table[name] = with_unit(table[name], unit)
+    return replace(field, stars=stars, dropped=dropped)
 
 
 def first_field(image, rules):
@@ -248,9 +262,10 @@ def first_field(image, rules):
         data[window] -= np.where(good, np.percentile(data[window][good], 20),
                                  0)
         parts.append(_found_in(window, data[window], variance[window], rules))
-    stars = QTable({name: np.concatenate([part[name] for part in parts])
-                    for name in ('x', 'y', 'flux', 'merit', 'selected',
-                                 'reason')})
+    if not parts:
+        msg = 'data must have pixels that are not bad, got none'
+        raise ValueError(msg)
+    stars = vstack(parts)
     _check_number(stars, rules)
     weak = np.argsort(-stars['merit'])[psf_stars.FIRST_STARS:]
     stars['selected'][weak] = False

@@ -84,7 +84,8 @@ def judge(table, variance, psf_error, rules):
     Parameters
     ----------
     table : `~astropy.table.QTable`
-        The stars, as of `CrowdedMixturePhotometry`.
+        The stars, as of `CrowdedMixturePhotometry`, with their distance
+        ``margin`` to the border of what was solved [pix].
     variance : (ny, nx) `~numpy.ndarray`
         Of the image, 0 where a pixel is bad.
     psf_error : float
@@ -104,10 +105,11 @@ def judge(table, variance, psf_error, rules):
         snr = flux / np.asarray(table['flux_err'], float)
         doubt = np.hypot(1 / snr, psf_error * (1 / own_light - 1))
     flags = np.asarray(table['flags'])
-    outside, masked = _lost_pixels(x, y, variance, rules.radius)
+    masked = _without_core(x, y, variance)
     reason = np.full(len(table), '', dtype='U9')
     for name, applies in (
-            ('edge', outside), ('masked', masked | (flags & SATURATED > 0)),
+            ('edge', np.asarray(table['margin']) < rules.radius),
+            ('masked', masked | (flags & SATURATED > 0)),
             ('faint', ~(snr >= rules.min_snr)),
             ('extended', flags & NOT_A_STAR > 0),
             ('blended', ~(own_light > _OWN_LIGHT))):
@@ -146,14 +148,11 @@ def _is_given(x, y, flux, given):
     return meant
 
 
-def _lost_pixels(x, y, variance, radius):
-    """Return whose stamps leave the image, and whose cores have bad pixels."""
-    ny, nx = variance.shape
-    outside = ((np.minimum(x, nx - 1 - x) < radius)
-               | (np.minimum(y, ny - 1 - y) < radius))
-    column, row = (np.clip(np.rint(v), 0, n - 1).astype(int)
-                   for v, n in ((x, nx), (y, ny)))
-    return outside, maximum_filter(variance <= 0, _CORE)[row, column]
+def _without_core(x, y, variance):
+    """Return which stars have bad pixels in their cores."""
+    row, column = (np.clip(np.rint(v), 0, n - 1).astype(int)
+                   for v, n in zip((y, x), variance.shape, strict=True))
+    return maximum_filter(variance <= 0, _CORE)[row, column]
 
 
 def _even_choice(x, y, doubt, shape, most):
