@@ -8,8 +8,9 @@ A `tile` is a `model`, stars on the mesh of `background`, and the `equations`
 of its joint fit. `stars` has the one form that stars have from list or search
 to the table, and who is beside whom; `table` says what is reported of each.
 `psf_loop` makes the PSF of the image's own stars, which `psf_stars` chooses,
-for `own_psf`, that has `fit_crowded_psf`. `injection` has `inject_and_recover`, artificial stars for completeness and
-errors. Changing where tiles are cut must not change a star: tests hold that.
+for `own_psf`, that has `fit_crowded_psf`. `injection` has
+`inject_and_recover`, artificial stars for completeness and errors. Changing
+where tiles are cut must not change a star: tests hold that.
 """
 from photutils_mgauss.utils.lazy import hand_on
 

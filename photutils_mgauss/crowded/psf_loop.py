@@ -9,7 +9,7 @@ what is searched for is therefore well above that, and a pass does not go as
 deep as photometry does afterwards.
 """
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from astropy.table import QTable, vstack
@@ -52,7 +52,7 @@ _FAINTEST = 1e-3
 class LoopOptions:
     """What `fit_crowded_psf` is told."""
 
-    rules: psf_stars.Rules = psf_stars.Rules()
+    rules: psf_stars.Rules = field(default_factory=psf_stars.Rules)
     n_components: int = 6
     degree: object = 'auto'
     max_passes: int = 8
