@@ -57,6 +57,7 @@ _OWNERS = {
     'PixelPhaseError': 'photometry',
     'to_flux_densities': 'photometry',
     'CrowdedMixturePhotometry': 'crowded',
+    'fit_crowded_psf': 'crowded',
     'inject_and_recover': 'crowded',
     'InjectionResult': 'crowded',
     'UnfinishedTilesError': 'crowded',

@@ -30,9 +30,10 @@ def add(commands):
         'places on the sky with covariances.',
         'mgauss photometry night1.fits --psf night1_psf.fits', run)
     tools.add_inputs(parser, 'IMAGE', 'images')
-    parser.add_argument('--psf', nargs='+', required=True, metavar='FILE',
+    parser.add_argument('--psf', nargs='+', default=[], metavar='FILE',
                         help='PSF of all images, or one for each: a file of '
-                             'mgauss psf, or any it could read')
+                             'mgauss psf, or any it could read (default with '
+                             '--crowded: made of the stars of each image)')
     parser.add_argument('--output', metavar='NAME',
                         help='folder, or for a single image a file: .ecsv or '
                              '.fits (default: IMAGE_cat.ecsv)')
@@ -62,6 +63,10 @@ def add_measuring(parser):
 def run(options):
     """Measure the images."""
     paths = options.inputs
+    if not options.psf and not options.crowded:
+        msg = ('--psf must be given, got none; without it, mgauss psf makes '
+               'one of an image, and --crowded one of the stars of each image')
+        raise ValueError(msg)
     tools.check_inputs([*paths, *options.psf])
     tools.check_different(paths)
     names = tools.output_names(paths, options.output, '_cat', _SUFFIXES,
@@ -73,7 +78,7 @@ def run(options):
     with Progress(1 + len(names), options) as step:
         step('look at all files')
         psfs = {path: _read_psf(path, options.checkpoint)
-                for path in dict.fromkeys(owners)}
+                for path in dict.fromkeys(options.psf)}
         for i in range(len(paths)):
             psf_command.check_image(read(i))
         for i, name in enumerate(names):
@@ -82,8 +87,8 @@ def run(options):
             key = results.key(file_marks(paths[i], owners[i],
                                          image.reading.wcs), image.content)
             results.obtain(name, key, partial(
-                make, options, image, psfs[owners[i]], name,
-                psf=str(owners[i])))
+                make, options, image, psfs.get(owners[i]), name,
+                psf=owners[i] and str(owners[i])))
             results.deliver()
             tools.say(options, f'{name} is written')
 
@@ -153,10 +158,26 @@ def _sparse(image, psf, options):
 
 def _crowded(image, psf, options):
     from photutils_mgauss.crowded.photometry import CrowdedMixturePhotometry
+    if psf is None:
+        psf = _own_psf(image, options)
     photometry = CrowdedMixturePhotometry(
         psf, threshold=options.threshold or 4.5,
         effective_gain=image.noise.gain, checkpoint=options.checkpoint)
     return photometry(image.data, error=image.noise.total, mask=image.mask)
+
+
+def _own_psf(image, options):
+    """Return the PSF of the stars of a crowded image."""
+    from photutils_mgauss.crowded.own_psf import fit_crowded_psf
+    from photutils_mgauss.crowded.psf_loop import grid_of
+    field = fit_crowded_psf(
+        image.data, error=image.noise.total, mask=image.mask,
+        saturation=image.saturation, effective_gain=image.noise.gain,
+        checkpoint=options.checkpoint)
+    tools.say(options, f'{image.path}: PSF from '
+                       f'{int(field.stars["used"].sum())} of its stars, '
+                       f'degree {field.degree}')
+    return grid_of(field)
 
 
 def _fwhm(psf, shape):

@@ -7,13 +7,16 @@ the residual, `bright` treats saturated stars, `given` a list of the user's.
 A `tile` is a `model`, stars on the mesh of `background`, and the `equations`
 of its joint fit. `stars` has the one form that stars have from list or search
 to the table, and who is beside whom; `table` says what is reported of each.
-`injection` has `inject_and_recover`, artificial stars for completeness and
-errors. Changing where tiles are cut must not change a star: tests hold that.
+`psf_loop` makes the PSF of the image's own stars, which `psf_stars` chooses,
+for `own_psf`, that has `fit_crowded_psf`. `injection` has
+`inject_and_recover`, artificial stars for completeness and errors. Changing
+where tiles are cut must not change a star: tests hold that.
 """
 from photutils_mgauss.utils.lazy import hand_on
 
 __getattr__, __dir__, __all__ = hand_on(__name__, {
     'CrowdedMixturePhotometry': 'photometry',
+    'fit_crowded_psf': 'own_psf',
     'inject_and_recover': 'injection',
     'InjectionResult': 'injection',
     'UnfinishedTilesError': 'photometry',

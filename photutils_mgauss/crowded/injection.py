@@ -133,7 +133,7 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     flux_ratio = as_real(flux_ratio, 'flux_ratio', above=1)
     before = photometry(data, mask=mask, error=error)
     known = positions(before)
-    renderer = MixtureRenderer(photometry.psf_model)
+    renderer = MixtureRenderer(photometry.psf_used)
     faintest = _FAINTEST * np.sqrt(variance[variance > 0].min(initial=np.inf))
     tables = []
     for _ in range(repeats):

@@ -102,8 +102,9 @@ class CrowdedMixturePhotometry:
 
     Parameters
     ----------
-    psf_model : GriddedMixturePSF or MultiGaussianPSFModel
-        The PSF.
+    psf_model : GriddedMixturePSF, MultiGaussianPSFModel or None
+        The PSF. With None each image is measured with the PSF that
+        `fit_crowded_psf` makes of its own stars.
     threshold : float, optional
         The significance from which a star is added, in standard errors of
         its flux.
@@ -164,6 +165,11 @@ class CrowdedMixturePhotometry:
     results : `~astropy.table.QTable`
         The last table; where several threads call the object, that of this
         thread.
+    field : MixtureField or None
+        The PSF that was made of the stars of the last image, if
+        ``psf_model`` is None.
+    psf_used : GriddedMixturePSF or MultiGaussianPSFModel
+        The PSF of the last table, ``psf_model`` unless that is None.
 
     Raises
     ------
@@ -175,8 +181,8 @@ class CrowdedMixturePhotometry:
     Columns beside photutils' own: ``xy_cov``, the covariance of x and y
     [pix^2]; ``x_psf_err``, ``y_psf_err`` and ``flux_psf_err``, the part of the
     errors that is due to the PSF, if it is known; ``significance`` of the
-    detection; ``crowding``, the star's share of the light of all stars in its fit pixels; ``neighbor_distance`` [pix]
-    and ``neighbor_correlation``, the correlation with the nearest
+    detection; ``crowding``, the star's share of the light of all stars in its
+    fit pixels; ``neighbor_distance`` [pix] and ``neighbor_correlation``, the correlation with the nearest
     neighbour's flux; ``iter_detected``. Bits of ``flags`` beside photutils'
     own: 65536, most of the star is masked, as of saturated ones; 131072, a
     blend, the correlation is beyond 0.5; 262144, not a star: part of
@@ -205,6 +211,8 @@ class CrowdedMixturePhotometry:
     """
 
     results = PerThread('The table of the last call.')
+    field = PerThread('The PSF made of the stars of the last image.')
+    psf_used = PerThread('The PSF of the last table.')
     _noise = PerThread('The noise of a pixel of the last image.')
 
     def __init__(self, psf_model, *, threshold=4.5, keep=2.0, depth=3.5,
@@ -240,10 +248,11 @@ class CrowdedMixturePhotometry:
             self.xy_bounds = as_real(xy_bounds, 'xy_bounds', above=0)
         self.checkpoint = checkpoint
         self._checkpoint = Checkpoint(checkpoint)
-        self.results = None
+        self.results = self.field = None
         self._noise = np.inf
-        self._psf = LocalPSF.of(psf_model)
         self.psf_errors = bool(psf_errors)
+        self.psf_used = psf_model
+        self._psf = None if psf_model is None else LocalPSF.of(psf_model)
 
     def __call__(self, data, *, mask=None, error=None, init_params=None):
         """
@@ -281,8 +290,9 @@ class CrowdedMixturePhotometry:
         image = read_pixels(data, error, mask).with_error()
         given = (None if init_params is None
                  else self._listed(init_params, image.unit))
+        psf = self._psf_of(image)
         options = self._options(image)
-        plan = Plan(image, self._psf, options, self.tile_shape, self.overlap,
+        plan = Plan(image, psf, options, self.tile_shape, self.overlap,
                     given, self._checkpoint)
         outcomes, errors = run(plan, self.executor, self.progress_bar)
         unfinished = [core for core, outcome in zip(plan.cores, outcomes,
@@ -290,12 +300,41 @@ class CrowdedMixturePhotometry:
                       if outcome is None]
         table = self._table(outcomes, given, image.unit)
         if self.psf_errors:
-            add_psf_errors(table, image, self.psf_model,
+            add_psf_errors(table, image, self.psf_used,
                            executor=self.executor)
         keep(self, results=table, _noise=options.noise)
         if unfinished:
             raise UnfinishedTilesError(unfinished, table) from errors[0]
         return table
+
+    def _psf_of(self, image):
+        """Return the PSF of an image, made of its stars if none is known."""
+        if self._psf is not None:
+            return self._psf
+        from photutils_mgauss.crowded.psf_loop import LoopOptions
+        field, model = self.fit_field(image, LoopOptions(
+            progress_bar=self.progress_bar))
+        keep(self, field=field, psf_used=model)
+        return LocalPSF.of(model)
+
+    def fit_field(self, image, options):
+        """
+        Fit the PSF of an image, PixelData with errors, to its stars.
+
+        Returns
+        -------
+        MixtureField, GriddedMixturePSF
+        """
+        from photutils_mgauss.crowded.psf_loop import fit_field, grid_of
+        field = fit_field(image, options, self._with_psf, self.effective_gain)
+        return field, grid_of(field)
+
+    def _with_psf(self, psf_model, **changes):
+        """Return the same photometry with a PSF and other settings."""
+        same = {name: getattr(self, name) for name in (
+            'count_slope', 'background_size', 'maxiters', 'tile_shape',
+            'overlap', 'executor', 'checkpoint')}
+        return type(self)(psf_model, psf_errors=False, **same | changes)
 
     def _listed(self, init_params, unit):
         x, y, flux, number = _given(init_params, unit)
@@ -411,7 +450,7 @@ class CrowdedMixturePhotometry:
         stars[2, (table['flags'] & REPEATED) > 0] = 0
         window = None if psf_shape is None else as_shape(psf_shape,
                                                          'psf_shape')
-        image = MixtureRenderer(self.psf_model).image(
+        image = MixtureRenderer(self.psf_used).image(
             stars, _FAINTEST * self._noise, shape, window)
         if include_local_bkg and len(table):
             image += _nearest_background(table, shape)

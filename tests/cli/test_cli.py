@@ -220,6 +220,17 @@ def test_a_crowded_measurement_finds_the_same_stars(chain, monkeypatch):
     assert len(shared) > 0.8 * len(sparse)
 
 
+def test_a_crowded_measurement_makes_the_psf_of_the_image(chain, monkeypatch):
+    monkeypatch.chdir(chain)
+    assert main(['photometry', 'images/night1.fits', '--crowded', '--output',
+                 'own.fits', '--log-file', 'own.log', '--quiet']) == 0
+    assert 'PSF from' in (chain / 'own.log').read_text()
+    table = QTable.read(chain / 'own.fits')
+    assert json.loads(table.meta['MGRUN'])['psf'] is None
+    known = QTable.read(chain / 'crowded.fits')
+    assert abs(len(table) - len(known)) < 0.1 * len(known)
+
+
 def test_a_catalogue_remembers_the_wcs_it_was_measured_with(chain,
                                                             monkeypatch):
     monkeypatch.chdir(chain)

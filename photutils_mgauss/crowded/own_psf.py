@@ -1,0 +1,140 @@
+"""The PSF of a crowded image, from nothing but the image."""
+from dataclasses import replace
+
+import numpy as np
+
+from photutils_mgauss.crowded.photometry import CrowdedMixturePhotometry
+from photutils_mgauss.crowded.psf_loop import LoopOptions
+from photutils_mgauss.crowded.psf_stars import Rules
+from photutils_mgauss.utils.image import read_level, read_pixels
+from photutils_mgauss.utils.star_columns import read_sources
+from photutils_mgauss.utils.validation import as_integer, as_real
+
+__all__ = ['fit_crowded_psf']
+
+
+def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
+                    n_components=6, degree='auto', radius=15, max_stars=200,
+                    min_snr=50, saturation=None, effective_gain=None,
+                    background_size=64, max_passes=8, executor=None,
+                    checkpoint=None, progress_bar=False):
+    """
+    Fit the PSF of a crowded image and its stars in turns.
+
+    A round PSF of the least blended bright stars finds all bright stars of
+    the image; what is left when all but the best of them are subtracted
+    tells a better PSF, which finds fainter stars. From pass to pass the
+    search goes deeper and the PSF varies more over the image, until it
+    changes no more.
+
+    Of images larger than 1536 pixels, five windows of 320 pixels along each
+    long axis are used.
+
+    Parameters
+    ----------
+    data : (ny, nx) array_like or NDData
+        The image, with its background. Its own mask counts, its unit comes
+        back: see :ref:`pixels`.
+    error : float or (ny, nx) array_like, optional
+        The standard deviation of each pixel in the unit of ``data``. By
+        default it is estimated, one number for the image.
+    mask : (ny, nx) array_like of bool, optional
+        True for pixels to leave out, as those of saturated stars.
+    stars : `~astropy.table.Table`, optional
+        Positions ``x`` and ``y`` of the only stars that the PSF may be
+        measured from; by default any. Those that are not ``selected``, if
+        there is such a column, do not count.
+    n_components : int, optional
+        The number K of Gaussians.
+    degree : int or 'auto', optional
+        The degree of the polynomials of the last pass, 0 for a PSF that is
+        the same everywhere. 'auto' is as high as there are eight stars for
+        each term, at most 4. Terms that the stars do not ask for are shrunk.
+    radius : float, optional
+        The radius of the circle of pixels around each star that is fitted
+        [pix].
+    max_stars : int, optional
+        How many stars the PSF is measured from at most, spread over the
+        image.
+    min_snr : float, optional
+        The least ratio of a star's flux to its error.
+    saturation : float, optional
+        Pixels at or above this value are left out.
+    effective_gain : float, optional
+        As for `CrowdedMixturePhotometry`.
+    background_size : float or None, optional
+        As for `CrowdedMixturePhotometry`.
+    max_passes : int, optional
+        The largest number of passes. A warning says if the PSF still
+        changes after them.
+    executor : `~concurrent.futures.Executor`, optional
+        Where stars are looked for; by default a pool of threads.
+    checkpoint : str or path-like, optional
+        A folder in which finished searches are kept. A call with the same
+        image and settings takes them from there.
+    progress_bar : bool, optional
+        Whether to show a bar of the passes, with the number of stars and
+        the change of the PSF.
+
+    Returns
+    -------
+    MixtureField
+        Its ``stars`` are those the PSF was measured from, its ``dropped``
+        the other bright ones with their ``x``, ``y``, ``flux``, ``snr``,
+        ``crowding`` and the ``reason``: 'edge'; 'masked', near bad pixels;
+        'faint'; 'extended'; 'blended', more than half of the light in its
+        pixels is that of others; 'surplus', there are better ones nearby;
+        'deviant', unlike the others. ``to_grid`` makes it a PSF for
+        `CrowdedMixturePhotometry`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not valid, or fewer than five stars are good for a
+        PSF.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from photutils_mgauss import (CrowdedMixturePhotometry,
+    ...                               GaussianMixture, fit_crowded_psf)
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[1.0, 0.2], [0.2, 0.8]]])
+    >>> rng = np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 99, (2, 400))
+    >>> flux = 300 * rng.pareto(1, 400) + 100
+    >>> light = sum(psf.render((100, 100), *star, flux=f)
+    ...             for *star, f in zip(x, y, flux))
+    >>> error = np.sqrt(light + 20)
+    >>> data = rng.normal(light + 20, error)
+    >>> field = fit_crowded_psf(data, error=error, n_components=1, radius=8)
+    >>> field.mixture_at(50, 50).covariances[0].round(1)
+    array([[1. , 0.2],
+           [0.2, 0.8]])
+    """
+    image = read_pixels(data, error, mask).with_error()
+    given = None
+    if stars is not None:
+        sources = read_sources(stars, unit=image.unit)
+        given = np.column_stack([sources.x, sources.y])[sources.selected]
+        given = given[np.isfinite(given).all(axis=1)]
+    if saturation is not None:
+        level = read_level(saturation, 'saturation', image.unit)
+        too_bright = image.data >= level
+        image = replace(image, mask=too_bright if image.mask is None
+                        else image.mask | too_bright)
+    rules = Rules(
+        radius=as_real(radius, 'radius', minimum=5),
+        max_stars=as_integer(max_stars, 'max_stars', minimum=1),
+        min_snr=as_real(min_snr, 'min_snr', above=0), given=given)
+    if degree != 'auto':
+        degree = as_integer(degree, 'degree', minimum=0)
+    options = LoopOptions(
+        rules, n_components=as_integer(n_components, 'n_components',
+                                       minimum=1),
+        degree=degree, max_passes=as_integer(max_passes, 'max_passes',
+                                             minimum=1),
+        progress_bar=bool(progress_bar))
+    photometry = CrowdedMixturePhotometry(
+        None, effective_gain=effective_gain, background_size=background_size,
+        executor=executor, checkpoint=checkpoint)
+    return photometry.fit_field(image, options)[0]

@@ -1,0 +1,364 @@
+r"""
+The PSF of a crowded image and its stars, in turns.
+
+A round PSF of the least blended stars finds the bright stars; these, all
+others subtracted, tell a better one, which finds fainter stars, and so on.
+The search goes deeper and the polynomials higher from pass to pass. Light
+that a PSF misses is taken for faint stars and sky around the bright ones;
+what is searched for is therefore well above that, and a pass does not go as
+deep as photometry does afterwards.
+"""
+import warnings
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from astropy.table import QTable, vstack
+from astropy.utils.exceptions import AstropyUserWarning
+
+from photutils_mgauss.crowded import psf_stars
+from photutils_mgauss.field.base import lattice
+from photutils_mgauss.field.fit import fit_mixture_field
+from photutils_mgauss.field.stages import n_terms
+from photutils_mgauss.psf.renderer import MixtureRenderer
+from photutils_mgauss.utils.image import with_unit
+
+# The significance of the faintest stars of each pass; the last goes on.
+_THRESHOLDS = (40.0, 30.0, 20.0, 15.0, 12.0)
+# The radius of the stamps of the first passes [pix], while there are still
+# many faint stars in the wings.
+_RADII = (8.0, 12.0)
+# In these, too, the sky is a little too bright everywhere, by the light of
+# wings that are not yet in the PSF. Later it is known better from all stars
+# together than from one stamp, which cannot tell it from a wing.
+_OWN_SKY = 2
+# Residuals below this many times the PSF's relative error are not taken for
+# stars; the PSF is known no better than the least and no worse than the most.
+_CAUTION, _LEAST_ERROR, _MOST_ERROR = 2.0, 0.01, 0.3
+# 'auto' goes up to this degree, with so many stars for each term.
+_TOP_DEGREE, _STARS_PER_TERM = 4, 8
+# The PSF has come to rest when it changes by less than this from one pass to
+# the next, as a fraction, or by more than this part of the change before.
+_REST, _STALL = 1e-3, 0.7
+# Of larger images, so many windows of this size along an axis are solved:
+# enough stars for a PSF [pix].
+_LARGEST, _WINDOW, _WINDOWS = 1536, 320, 5
+# Where the PSF of two passes is compared, and how far from its centre [pix].
+_PLACES, _REACH = (3, 3), 8
+# Stars are drawn out to where this fraction of the noise is left of them.
+_FAINTEST = 1e-3
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """What `fit_crowded_psf` is told."""
+
+    rules: psf_stars.Rules = field(default_factory=psf_stars.Rules)
+    n_components: int = 6
+    degree: object = 'auto'
+    max_passes: int = 8
+    progress_bar: bool = False
+
+    def radius(self, number):
+        """Return the radius of the stamps of a pass."""
+        return min((*_RADII, self.rules.radius)[min(number, len(_RADII))],
+                   self.rules.radius)
+
+    def degree_of(self, number, n_stars):
+        """Return the degree of a pass with so many stars."""
+        top = _TOP_DEGREE if self.degree == 'auto' else self.degree
+        degree = min(number, top)
+        if self.degree == 'auto':
+            while degree and n_stars < _STARS_PER_TERM * n_terms(degree):
+                degree -= 1
+        return degree
+
+    def is_last_kind(self, number, degree, n_stars):
+        """Tell whether later passes are no deeper, wider or higher."""
+        return (number >= max(len(_THRESHOLDS) - 1, len(_RADII))
+                and degree == self.degree_of(number + 1, n_stars))
+
+
+@dataclass(frozen=True)
+class CrowdedImage:
+    """
+    Data and variance (ny, nx), both 0 at bad pixels, and what is solved.
+
+    ``windows`` are the parts (slice, slice) of the image that are looked at,
+    ``gain`` the electrons per unit, infinite if the error has no photons of
+    the stars in it.
+    """
+
+    pixels: object
+    gain: float
+
+    @classmethod
+    def of(cls, pixels, effective_gain):
+        """Return the image with its gain, found out if it is not given."""
+        gain = pixels.gain() if effective_gain is None else effective_gain
+        return cls(pixels, np.inf if gain is None else float(gain))
+
+    @property
+    def shape(self):
+        """The shape of the image."""
+        return self.pixels.shape
+
+    @property
+    def windows(self):
+        """The parts of the image that are solved, (slice, slice) each."""
+        rows, columns = (_spread(n) for n in self.shape)
+        return [(row, column) for row in rows for column in columns]
+
+
+def _spread(n):
+    """Return slices along an axis, all of a short one."""
+    if n <= _LARGEST:
+        return [slice(0, n)]
+    first = np.linspace(0, n - _WINDOW, _WINDOWS).round().astype(int)
+    return [slice(low, low + _WINDOW) for low in first]
+
+
+@dataclass(frozen=True)
+class Solved:
+    """
+    An image solved with a PSF: its stars, and what is left of it.
+
+    ``residual`` and ``variance`` (ny, nx) are of the data less all stars and
+    the sky; the variance, 0 where nothing was solved, has the photon noise
+    of the model.
+    """
+
+    table: QTable
+    residual: np.ndarray
+    variance: np.ndarray
+    noise: float
+
+    @classmethod
+    def with_psf(cls, image, psf, solve, **options):
+        """Solve the windows of an image."""
+        residual, variance = np.zeros(image.shape), np.zeros(image.shape)
+        tables, noise = [], []
+        for window in image.windows:
+            data, before = image.pixels.part(window)
+            if not (before > 0).any():
+                continue
+            table, model = _solve_window(data, before, _moved(psf, window),
+                                         image.gain, solve, options)
+            residual[window] = np.where(before > 0, data - model, 0)
+            variance[window] = _of_model(before, residual[window], image.gain)
+            tables.append(_in_image(table, window))
+            noise.append(np.median(before[before > 0]))
+        return cls(vstack(tables), residual, variance,
+                   float(np.sqrt(np.median(noise))))
+
+    def with_stars(self, psf, stars):
+        """Return the data less the sky and all stars but these."""
+        image = self.residual.copy()
+        MixtureRenderer(psf).add(
+            np.array([stars['x'], stars['y'], stars['flux']]),
+            _FAINTEST * self.noise, 0, 0, image)
+        image[self.variance == 0] = 0
+        return image
+
+
+def _solve_window(data, variance, psf, gain, solve, options):
+    """Return the stars of a window and the image of its model."""
+    photometry = solve(psf, effective_gain=gain, **options)
+    with warnings.catch_warnings():
+        # That the PSF is not good yet is no news.
+        warnings.simplefilter('ignore', AstropyUserWarning)
+        table = photometry(data, error=np.sqrt(variance))
+    return table, photometry.make_model_image(data.shape,
+                                              include_local_bkg=True)
+
+
+def _in_image(table, window):
+    """Return stars in image pixels, with their distance to the border."""
+    out = {name: np.asarray(table[name])
+           for name in ('flux_fit', 'flux_err', 'crowding', 'flags')}
+    margin = np.full(len(table), np.inf)
+    for name, part in zip('xy', window[::-1], strict=True):
+        place = np.asarray(table[f'{name}_fit'])
+        out[f'{name}_fit'] = place + part.start
+        margin = np.minimum.reduce([
+            margin, place, part.stop - part.start - 1 - place])
+    return QTable(out | {'margin': margin})
+
+
+def _of_model(variance, residual, gain):
+    """Return the variance with the photons of the model, not of the data."""
+    good = variance > 0
+    least = variance[good].min()
+    return np.where(good, np.maximum(variance - residual / gain, least), 0)
+
+
+def _moved(psf, window):
+    """Return a grid in the coordinates of a window."""
+    row, column = window
+    return type(psf)(psf.mixtures, np.asarray(psf.grid_xypos)
+                     - [column.start, row.start])
+
+
+def fit_field(pixels, options, solve, effective_gain=None):
+    """
+    Fit a field to a crowded image.
+
+    Parameters
+    ----------
+    pixels : PixelData
+        With its error.
+    options : LoopOptions
+    solve : callable
+        Given a `GriddedMixturePSF` and the keywords ``threshold``, ``depth``,
+        ``psf_error`` and ``effective_gain``, it returns a
+        `CrowdedMixturePhotometry`.
+    effective_gain : float, optional
+
+    Returns
+    -------
+    MixtureField
+    """
+    image = CrowdedImage.of(pixels, effective_gain)
+    field = first_field(image, options.rules)
+    bar = _bar(options.max_passes) if options.progress_bar else None
+    before = np.inf
+    for number in range(options.max_passes):
+        last, field = field, next_field(image, field, number, options, solve)
+        change = difference(field, last)
+        if bar is not None:
+            _advance(bar, field, change)
+        if options.is_last_kind(number, field.degree, len(field.stars)) and (
+                change < _REST or change > _STALL * before):
+            break
+        before = change
+    else:
+        warnings.warn(
+            f'the PSF still changes by {change:.2%} from pass to pass after '
+            f'max_passes={options.max_passes}', AstropyUserWarning,
+            stacklevel=4)
+    if bar is not None:
+        bar.close()
+    return _with_unit(field, pixels.unit)
+
+
+def _with_unit(field, unit):
+    """Return the field with the unit of the image in its tables."""
+    stars, dropped = field.stars.copy(), field.dropped.copy()
+    for table, names in ((stars, ('flux_fit', 'local_bkg')),
+                         (dropped, ('flux',))):
+        for name in names:
+            table[name] = with_unit(table[name], unit)
+    return replace(field, stars=stars, dropped=dropped)
+
+
+def first_field(image, rules):
+    """Fit two Gaussians, the same everywhere, to the least blended stars."""
+    data, variance = np.zeros(image.shape), np.zeros(image.shape)
+    parts = []
+    for window in image.windows:
+        data[window], variance[window] = image.pixels.part(window)
+        good = variance[window] > 0
+        if not good.any():
+            continue
+        data[window] -= np.where(good, np.percentile(data[window][good], 20),
+                                 0)
+        parts.append(_found_in(window, data[window], variance[window], rules))
+    if not parts:
+        msg = 'data must have pixels that are not bad, got none'
+        raise ValueError(msg)
+    stars = vstack(parts)
+    _check_number(stars, rules)
+    weak = np.argsort(-stars['merit'])[psf_stars.FIRST_STARS:]
+    stars['selected'][weak] = False
+    return fit_mixture_field(
+        data, stars, error=np.sqrt(variance), n_components=2, degree=0,
+        radius=psf_stars.FIRST_RADIUS, local_bkg=True)
+
+
+def _found_in(window, data, variance, rules):
+    """Return the stars of a window, at their places in the image."""
+    start = np.array([window[1].start, window[0].start])
+    if rules.given is not None:
+        rules = replace(rules, given=rules.given - start)
+    found = psf_stars.first_stars(data, variance, rules)
+    for name, first in zip('xy', start, strict=True):
+        found[name] += first
+    return found
+
+
+def next_field(image, field, number, options, solve):
+    """Solve the image with a field, and fit the next one to its stars."""
+    rules = options.rules
+    psf = grid_of(field)
+    threshold = _THRESHOLDS[min(number, len(_THRESHOLDS) - 1)]
+    psf_error = float(np.clip(_CAUTION * field.accuracy, _LEAST_ERROR,
+                              _MOST_ERROR))
+    solved = Solved.with_psf(image, psf, solve, threshold=threshold,
+                             depth=threshold, psf_error=psf_error)
+    stars = psf_stars.judge(solved.table, solved.variance,
+                            max(field.accuracy, _LEAST_ERROR), rules)
+    _check_number(stars, rules)
+    used = stars[stars['selected']]
+    new = fit_mixture_field(
+        solved.with_stars(psf, used), used, error=np.sqrt(solved.variance),
+        n_components=options.n_components,
+        degree=options.degree_of(number, len(used)),
+        radius=options.radius(number), local_bkg=number < _OWN_SKY,
+        effective_gain=np.inf)
+    return _with_reasons(new, stars)
+
+
+def _with_reasons(field, stars):
+    """Return the field with the bright stars that were not used, and why."""
+    chosen = np.flatnonzero(stars['selected'])
+    table, dropped = field.stars.copy(), stars.copy()
+    table['id'] = chosen[np.asarray(table['id']) - 1] + 1
+    dropped['id'] = np.arange(len(stars)) + 1
+    late = np.asarray(field.dropped['id']) - 1
+    dropped['reason'][chosen[late]] = field.dropped['reason']
+    dropped = dropped[dropped['reason'] != '']
+    return replace(field, stars=table, dropped=dropped[
+        'id', 'x', 'y', 'flux', 'snr', 'crowding', 'reason'])
+
+
+def _check_number(stars, rules):
+    """Raise if there are too few stars for any PSF."""
+    n = np.count_nonzero(stars['selected'])
+    if n >= psf_stars.FEWEST:
+        return
+    reasons = [str(reason) for reason in stars['reason'] if reason]
+    counts = ', '.join(f'{reasons.count(reason)} {reason}'
+                       for reason in sorted(set(reasons)))
+    msg = (f'data must show at least {psf_stars.FEWEST} stars good for the '
+           f'PSF, got {n} of {len(stars)}'
+           + (f': {counts}' if counts else '')
+           + f'; lower min_snr={rules.min_snr:g} or radius={rules.radius:g}, '
+             'or give a PSF from another exposure')
+    raise ValueError(msg)
+
+
+def grid_of(field):
+    """Return the field on as many nodes as its degree asks for."""
+    return field.to_grid(1 + 4 * field.degree)
+
+
+def difference(field, other):
+    """Return by what fraction the PSFs of two fields differ."""
+    steps = np.arange(-_REACH, _REACH + 1.0)
+    x, y = np.meshgrid(steps, steps)
+    squares = []
+    for place in zip(*lattice(_PLACES, field.shape), strict=True):
+        new, old = (one.mixture_at(*place).evaluate(x, y)
+                    for one in (field, other))
+        squares.append(((new - old)**2).sum() / (new**2).sum())
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _bar(n):
+    from tqdm import tqdm
+    return tqdm(total=n, desc='PSF')
+
+
+def _advance(bar, field, change):
+    used = int(np.count_nonzero(field.stars['used']))
+    bar.set_postfix(stars=used, degree=field.degree, change=f'{change:.2%}')
+    bar.update()

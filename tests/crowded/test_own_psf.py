@@ -1,0 +1,195 @@
+"""The PSF of a crowded image from its own stars."""
+from functools import cache
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import Table
+from astropy.utils.exceptions import AstropyUserWarning
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial import cKDTree
+
+from photutils_mgauss import (
+    CrowdedMixturePhotometry,
+    Instrument,
+    MixtureField,
+    crowded_field,
+    csst_psf,
+    fit_crowded_psf,
+    inject_and_recover,
+    simulate,
+)
+from photutils_mgauss.crowded import psf_loop
+
+SHAPE = (160, 160)
+QUICK = {'n_components': 3, 'degree': 1, 'radius': 10, 'max_stars': 60}
+
+
+@cache
+def scene():
+    psf = csst_psf(SHAPE)
+    return psf, simulate(crowded_field(SHAPE, rng=3), psf=psf, rng=4,
+                         instrument=Instrument(shape=SHAPE))
+
+
+def image():
+    seen = scene()[1]
+    return {'data': seen.image, 'error': seen.error, 'mask': seen.mask}
+
+
+@cache
+def field():
+    return fit_crowded_psf(**image(), **QUICK)
+
+
+def measured(psf):
+    pixels = image()
+    return CrowdedMixturePhotometry(psf)(
+        pixels['data'], error=pixels['error'], mask=pixels['mask'])
+
+
+def beside_truth(table, low, high):
+    """Return position errors (n,) and flux ratios of true stars found."""
+    truth = scene()[1].truth
+    magnitude = truth['mag'].value
+    truth = truth[truth['inside'] & (magnitude > low) & (magnitude < high)]
+    place, true = (np.array([t[x], t[y]]).T for t, x, y in (
+        (table, 'x_fit', 'y_fit'), (truth, 'x', 'y')))
+    gap, row = cKDTree(place).query(true)
+    error = (place[row] - true)[gap < 0.5]
+    ratio = np.asarray(table['flux_fit'])[row] / truth['flux']
+    # Where in a PSF its centre is has no meaning.
+    return np.hypot(*(error - np.median(error, axis=0)).T), ratio[gap < 0.5]
+
+
+@pytest.mark.parametrize(('low', 'high'), [(17, 20), (20, 22)])
+def test_stars_are_measured_as_well_as_with_the_true_psf(low, high):
+    true, own = (beside_truth(measured(psf), low, high)
+                 for psf in (scene()[0], psf_loop.grid_of(field())))
+    assert len(own[0]) >= 0.98 * len(true[0])
+    assert np.median(own[0]) < 1.15 * np.median(true[0])
+    assert abs(np.median(own[1]) - np.median(true[1])) < 0.015
+
+
+def test_each_bright_star_is_used_or_has_a_reason_why_not():
+    used, dropped = field().stars, field().dropped
+    ids = np.concatenate([used['id'], dropped['id']])
+    assert_array_equal(np.sort(np.unique(ids)), np.arange(1, ids.max() + 1))
+    assert set(dropped['reason']) <= {
+        'edge', 'masked', 'faint', 'extended', 'blended', 'surplus',
+        'deviant'}
+    assert (dropped['reason'] == 'edge').sum() > 3
+    assert len(used) == QUICK['max_stars']
+    margin = np.min([used['x'], used['y'], 159 - used['x'],
+                     159 - used['y']], axis=0)
+    assert margin.min() > QUICK['radius']
+
+
+def test_the_stars_are_spread_over_the_image():
+    x, y = (np.asarray(field().stars[name]) for name in 'xy')
+    count = np.histogram2d(x, y, bins=2, range=[[10, 149], [10, 149]])[0]
+    assert count.min() > 0.5 * count.mean()
+
+
+def test_none_is_the_psf_of_the_image():
+    data = image()['data'][:110, :110]
+    error = image()['error'][:110, :110]
+    phot = CrowdedMixturePhotometry(None)
+    table = phot(data, error=error)
+    own = fit_crowded_psf(data, error=error)
+    assert_array_equal(phot.field.coefficients, own.coefficients)
+    again = CrowdedMixturePhotometry(psf_loop.grid_of(own))(data, error=error)
+    assert_array_equal(table['x_fit'], again['x_fit'])
+    residual = phot.make_residual_image(data, include_local_bkg=True)
+    assert np.median(np.abs(residual / error)) < 1
+    phot = CrowdedMixturePhotometry(psf_loop.grid_of(own))
+    assert phot.field is None
+
+
+def test_artificial_stars_have_the_psf_of_the_image(monkeypatch):
+    known = field()
+    monkeypatch.setattr(psf_loop, 'fit_field', lambda *_args, **_kw: known)
+    pixels = image()
+    result = inject_and_recover(
+        CrowdedMixturePhotometry(None), pixels['data'], (3e4, 6e4),
+        error=pixels['error'], mask=pixels['mask'], rng=1)
+    assert result.stars['recovered'].mean() > 0.8
+
+
+def test_only_the_stars_of_a_list_are_used():
+    chosen = field().stars[::2]
+    stars = Table({'x': chosen['x_fit'], 'y': chosen['y_fit'],
+                   'selected': np.arange(len(chosen)) > 4})
+    own = fit_crowded_psf(**image(), **QUICK, stars=stars)
+    gap, row = cKDTree(np.column_stack([stars['x'], stars['y']])).query(
+        np.column_stack([own.stars['x'], own.stars['y']]))
+    assert gap.max() < 1.5
+    assert row.min() == 5
+
+
+def test_the_unit_of_the_image_comes_back(tmp_path):
+    pixels = image()
+    own = fit_crowded_psf(pixels['data'] * u.electron,
+                          error=pixels['error'] * u.electron,
+                          mask=pixels['mask'], **QUICK)
+    assert own.stars['flux_fit'].unit == own.dropped['flux'].unit == u.electron
+    assert_allclose(own.coefficients, field().coefficients)
+    own.write(tmp_path / 'field.fits')
+    again = MixtureField.read(tmp_path / 'field.fits')
+    assert_array_equal(again.dropped['reason'], own.dropped['reason'])
+
+
+def test_of_a_large_image_windows_are_used(monkeypatch):
+    monkeypatch.setattr(psf_loop, '_LARGEST', 100)
+    monkeypatch.setattr(psf_loop, '_WINDOW', 70)
+    monkeypatch.setattr(psf_loop, '_WINDOWS', 2)
+    own = fit_crowded_psf(**image(), **QUICK)
+    for name in 'xy':
+        place = np.asarray(own.stars[name])
+        assert (((place > 10) & (place < 59))
+                | ((place > 100) & (place < 149))).all()
+    assert psf_loop.difference(own, field()) < 0.05
+
+
+def test_a_checkpoint_gives_the_same(tmp_path):
+    data = image()['data'][:80, :80]
+    error = image()['error'][:80, :80]
+    options = {'error': error, **QUICK, 'checkpoint': tmp_path / 'kept'}
+    first, again = (fit_crowded_psf(data, **options) for _ in range(2))
+    assert_array_equal(first.coefficients, again.coefficients)
+
+
+def test_a_bar_shows_the_passes(capfd):
+    fit_crowded_psf(image()['data'][:80, :80],
+                    error=image()['error'][:80, :80], **QUICK,
+                    progress_bar=True)
+    assert 'stars=' in capfd.readouterr().err
+
+
+def test_a_psf_that_still_changes_is_said():
+    with pytest.warns(AstropyUserWarning, match='still changes .* after '
+                                                'max_passes=1'):
+        fit_crowded_psf(**image(), **QUICK, max_passes=1)
+
+
+@pytest.mark.parametrize(('changes', 'words'), [
+    ({'max_passes': 0}, 'max_passes must be at least 1'),
+    ({'radius': 1}, 'radius must be at least 5'),
+    ({'min_snr': -1}, 'min_snr must be'),
+    ({'degree': -1}, 'degree must be at least 0'),
+    ({'min_snr': 1e7}, 'at least 5 stars good for the PSF, got 0 of .*faint'),
+    ({'saturation': 25.0}, 'data must show'),
+    ({'stars': Table({'x': [3.0], 'y': [4.0]})}, 'at least 5 stars'),
+])
+def test_what_cannot_be_is_said(changes, words):
+    with pytest.raises(ValueError, match=words):
+        fit_crowded_psf(**image() | changes)
+
+
+def test_an_image_without_stars_is_said():
+    data = np.random.default_rng(1).normal(100, 10, (100, 100))
+    with pytest.raises(ValueError, match='data must show at least'):
+        fit_crowded_psf(data, error=10.0)
+    with pytest.raises(ValueError, match='data must have pixels'), (
+            pytest.warns(AstropyUserWarning, match='no pixel')):
+        fit_crowded_psf(data, error=10.0, mask=np.ones((100, 100), bool))
