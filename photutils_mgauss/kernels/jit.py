@@ -239,15 +239,19 @@ _NOT_NEEDED = frozenset({
     'AnnotateTypes', 'DumpParforDiagnostics'})
 
 
+# (function, types of arguments) -> signature, of calls.
+_SIGNATURES = {}
+
+# All sets of options that have been, so that equal ones are the same object.
+_KNOWN_FLAGS = []
+
+
 class _Typing:
     """
     The typing of a compilation, which remembers what calls return.
 
     numba asks a dozen possible meanings of a plus anew at each plus.
     """
-
-    # (function, types of arguments) -> signature.
-    _signatures = {}
 
     def __init__(self, context):
         self._context = context
@@ -261,13 +265,13 @@ class _Typing:
             # One version for all numbers, not one for each constant.
             args = tuple(map(types.unliteral, args))
         key = function, args
-        if not keywords and key in self._signatures:
-            return self._signatures[key]
+        if not keywords and key in _SIGNATURES:
+            return _SIGNATURES[key]
         found = self._context.resolve_function_type(function, args, keywords)
         # Others are written in Python, and compiled as each caller is.
         if (isinstance(function, types.Function) and not keywords and
                 function.get_impl_key(found) is function.typing_key):
-            self._signatures[key] = found
+            _SIGNATURES[key] = found
         return found
 
 
@@ -276,17 +280,14 @@ class _KnownFlags(Flags):
 
     __slots__ = ('_all',)
 
-    # All that have been, so that equal ones are the same.
-    _known = []
-
     @classmethod
     def of(cls, flags):
         """Return what equals these options."""
-        for known in cls._known:
+        for known in _KNOWN_FLAGS:
             if known == flags:
                 return known
-        cls._known.append(cls(flags))
-        return cls._known[-1]
+        _KNOWN_FLAGS.append(cls(flags))
+        return _KNOWN_FLAGS[-1]
 
     def __init__(self, flags):
         super().__init__(flags)

@@ -217,10 +217,11 @@ def _solve(parameters, equations, limits, n, size, work):
 
 
 @inner
-def _put_status(outcome, n, status):
-    """Give all stars of a group one outcome."""
+def _end(outcome, n, status, evaluations):
+    """Give all stars of a group one outcome; return the evaluations."""
     for s in range(n):
         status[s] = outcome
+    return evaluations
 
 
 @inner
@@ -263,6 +264,43 @@ def _keep(new, n, size, old):
 
 
 @inner
+def _begin(parameters, n, fit_sky, pixels, psf, scratch, work, equations,
+           chi2):
+    """Evaluate the first point of a group; return its sum of squares."""
+    for a in range(3 * n + fit_sky):
+        work.steepest[a] = 0.0
+    for s in range(n):
+        work.share[s] = np.inf
+    normal_equations(parameters, n, fit_sky, pixels, psf, scratch, equations,
+                     equations, chi2)
+    return chi2[1]
+
+
+@inner
+def _propose(parameters, equations, limits, n, size, work):
+    """
+    Put the next step, and its end, into work.
+
+    Returns by how much chi2 should fall, and the step's size.
+    """
+    _solve(parameters, equations, limits, n, size, work)
+    return (_expected(work.step, equations, size),
+            _step_size(work.step, parameters, equations.matrix, n))
+
+
+@inner
+def _accept(parameters, old, new, damping, n, size, work):
+    """Take the step; return its size, were it not damped."""
+    _share_fall(work.step, old, new, n, work.share)
+    if damping > 0:
+        _undamp(work.step, old.matrix, old.gradient, work.frozen, size)
+    length = _step_size(work.step, parameters, old.matrix, n)
+    copy_vector(work.trial, size, parameters)
+    _keep(new, n, size, old)
+    return length
+
+
+@inner
 def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
               limits, max_iterations, chi2):
     """
@@ -273,53 +311,33 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
     squares.
     """
     size = 3 * n + fit_sky
-    for a in range(size):
-        work.steepest[a] = 0.0
-    for s in range(n):
-        work.share[s] = np.inf
-    normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, old,
-                     chi2)
-    best = chi2[1]
+    best = _begin(parameters, n, fit_sky, pixels, psf, scratch, work, old,
+                  chi2)
     floor = 1e-24 * best
-    damping = 0.0
-    last = 0.0
-    fall = np.inf
+    damping, last, fall = 0.0, 0.0, np.inf
     for iteration in range(max_iterations):
         _freeze(parameters, limits, old.gradient, size, work.frozen)
         if not _factorize(old, damping, size, work, scratch.stop):
             damping = max(10 * damping, 1e-6)
             if damping > 1e3:
-                _put_status(_NOT_CONVERGED, n, work.status)
-                return iteration + 1
+                return _end(_NOT_CONVERGED, n, work.status, iteration + 1)
             continue
-        _solve(parameters, old, limits, n, size, work)
-        expected = _expected(work.step, old, size)
-        short = _step_size(work.step, parameters, old.matrix, n)
+        expected, short = _propose(parameters, old, limits, n, size, work)
         normal_equations(work.trial, n, fit_sky, pixels, psf, scratch, old,
                          new, chi2)
         if not chi2[0] <= best * (1 + 1e-12) + floor:
             if short < 1e-3 * STEP_TOLERANCE or damping > 1e12:
-                _put_status(STALLED, n, work.status)
-                return iteration + 2
-            damping = max(10 * damping, 1e-3)
-            last = 0.0
+                return _end(STALLED, n, work.status, iteration + 2)
+            damping, last = max(10 * damping, 1e-3), 0.0
             continue
-        _share_fall(work.step, old, new, n, work.share)
-        if damping > 0:
-            _undamp(work.step, old.matrix, old.gradient, work.frozen, size)
-        length = _step_size(work.step, parameters, old.matrix, n)
-        # Of a smaller fall nothing is left after rounding: keep the damping.
-        gain = ((best - chi2[0]) / expected if expected > 1e-9 * best
-                else POOR_GAIN)
+        length = _accept(parameters, old, new, damping, n, size, work)
         fall = best - chi2[0]
-        copy_vector(work.trial, size, parameters)
+        # Of a smaller fall nothing is left after rounding: keep the damping.
+        gain = fall / expected if expected > 1e-9 * best else POOR_GAIN
         best = chi2[1]
-        _keep(new, n, size, old)
         if remainder(length, last) < STEP_TOLERANCE:
-            _put_status(CONVERGED, n, work.status)
-            return iteration + 2
-        last = length
-        damping = next_damping(damping, gain)
+            return _end(CONVERGED, n, work.status, iteration + 2)
+        damping, last = next_damping(damping, gain), length
     _end_early(best, fall, n, work.share, work.status)
     return max_iterations + 1
 

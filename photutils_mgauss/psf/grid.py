@@ -16,7 +16,6 @@ import numpy as np
 from astropy.table import QTable
 from scipy.optimize import linear_sum_assignment
 
-from photutils_mgauss import kernels
 from photutils_mgauss.psf.mixture import GaussianMixture, _check_covariances
 from photutils_mgauss.psf.rows import integrals, kernel_rows, of_integrals
 from photutils_mgauss.utils.validation import as_floats
