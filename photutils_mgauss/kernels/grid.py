@@ -41,7 +41,7 @@ def _cell(position, grid):
     return i, fraction, 1 / width
 
 
-@kernel
+@inner
 def blend_weights(x_0, y_0, x_grid, y_grid, index, weights):
     """
     Find the four neighbours, for index (4,), and their bilinear weights.

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from numba import njit, types
 from numba.core.caching import FunctionCache, NullCache
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.typed_passes import NopythonTypeInference
 from numba.extending import intrinsic
@@ -50,7 +50,8 @@ def kernel(function=None, *, allocates=False):
     """Compile a function that Python calls, when it is first called."""
     if function is None:
         return partial(kernel, allocates=allocates)
-    dispatcher = njit(**_OPTIONS, _nrt=allocates)(function)
+    dispatcher = njit(**_OPTIONS, _nrt=allocates,
+                      pipeline_class=_KernelCompiler)(function)
     if dispatcher is not function:  # it is where numba is switched off
         dispatcher._cache = _keep(function)
         KERNELS[function.__name__] = dispatcher
@@ -224,8 +225,88 @@ def _say():
         _LOG.info(words)
 
 
-# Inner functions. Without the following everything works as well, but each
-# function is optimised again in every function that calls it.
+# How numba compiles. Without the following everything works as well, but
+# takes twice as long to be ready for the first time.
+
+# What numba's own pipeline does besides, for objects that kernels do without:
+# closures, contexts, literal unrolling, parallel loops, and expressions of
+# whole arrays.
+_NOT_NEEDED = frozenset({
+    'WithLifting', 'InlineClosureLikes', 'RewriteDynamicRaises',
+    'MakeFunctionToJitFunction', 'InlineInlinables', 'FindLiterallyCalls',
+    'LiteralUnroll', 'LiteralPropagationSubPipelinePass', 'InlineOverloads',
+    'NopythonRewrites', 'RewriteSemanticConstants', 'DeadBranchPrune',
+    'AnnotateTypes', 'DumpParforDiagnostics'})
+
+
+# (function, types of arguments) -> signature, of calls.
+_SIGNATURES = {}
+
+# All sets of options that have been, so that equal ones are the same object.
+_KNOWN_FLAGS = []
+
+
+class _Typing:
+    """
+    The typing of a compilation, which remembers what calls return.
+
+    numba asks a dozen possible meanings of a plus anew at each plus.
+    """
+
+    def __init__(self, context):
+        self._context = context
+
+    def __getattr__(self, name):
+        return getattr(self._context, name)
+
+    def resolve_function_type(self, function, args, keywords):
+        """Return the signature of a call."""
+        if isinstance(function, types.Dispatcher):
+            # One version for all numbers, not one for each constant.
+            args = tuple(map(types.unliteral, args))
+        key = function, args
+        if not keywords and key in _SIGNATURES:
+            return _SIGNATURES[key]
+        found = self._context.resolve_function_type(function, args, keywords)
+        # Others are written in Python, and compiled as each caller is.
+        if (isinstance(function, types.Function) and not keywords and
+                function.get_impl_key(found) is function.typing_key):
+            _SIGNATURES[key] = found
+        return found
+
+
+class _KnownFlags(Flags):
+    """Options that stay as they are; numba compares them very often."""
+
+    __slots__ = ('_all',)
+
+    @classmethod
+    def of(cls, flags):
+        """Return what equals these options."""
+        for known in _KNOWN_FLAGS:
+            if known == flags:
+                return known
+        _KNOWN_FLAGS.append(cls(flags))
+        return _KNOWN_FLAGS[-1]
+
+    def __init__(self, flags):
+        super().__init__(flags)
+        self._all = super().values()
+
+    def __hash__(self):
+        return super().__hash__()
+
+    def __eq__(self, other):
+        return self is other or super().__eq__(other)
+
+    def values(self):
+        """Return a dict of all the options."""
+        return self._all
+
+    def copy(self):
+        """Return the same."""
+        return self
+
 
 class _Lender:
     """The code generator of a library that only lends its code."""
@@ -244,10 +325,10 @@ class _Lender:
 
 
 @register_pass(mutates_CFG=False, analysis_only=True)
-class _LendCode(AnalysisPass):
-    """Leave machine code to the kernels that call."""
+class _PrepareCode(AnalysisPass):
+    """Optimise code once, all of a kernel together."""
 
-    _name = 'lend_code'
+    _name = 'prepare_code'
 
     def __init__(self):
         AnalysisPass.__init__(self)
@@ -263,7 +344,38 @@ class _LendCode(AnalysisPass):
         return False
 
     def prepare(self, library):
+        """Leave functions as they are until all are there."""
+        codegen, link = library._codegen, library.add_linking_library
+
+        def lay_out(module):
+            module.data_layout = codegen._data_layout
+
+        def optimize():
+            passes, builder = codegen._module_pass_manager()
+            passes.run(library._final_module, builder)
+
+        def link_all(other):
+            # Callers first: what nobody calls yet is not linked.
+            link(other)
+            for lender in getattr(other, 'lenders', ()):
+                link_all(lender)
+
+        library._optimize_functions = lay_out
+        library.add_linking_library = link_all
+        if hasattr(codegen, '_module_pass_manager'):
+            library._optimize_final_module = optimize
+
+
+@register_pass(mutates_CFG=False, analysis_only=True)
+class _LendCode(_PrepareCode):
+    """Leave machine code to the kernels that call."""
+
+    _name = 'lend_code'
+
+    def prepare(self, library):
         """Keep the library out of the running program."""
+        super().prepare(library)
+        library.lenders = []
         if hasattr(library, '_codegen'):
             library._codegen = _Lender(library._codegen)
 
@@ -276,27 +388,51 @@ class _LendRawCode(_LendCode):
 
     def prepare(self, library):
         """Keep the library as it is, and out of the running program."""
+        link = library.add_linking_library
         super().prepare(library)
+
+        def remember(other):
+            # A kernel gathers what it needs, which is copied once then.
+            if hasattr(other, 'lenders'):
+                other._ensure_finalized()
+                library.lenders.append(other)
+            else:
+                link(other)
+
         library._optimize_final_module = lambda: None
+        library.add_linking_library = remember
 
 
-class _LoopCompiler(CompilerBase):
-    """numba's own pipeline with such a pass in it."""
+class _KernelCompiler(CompilerBase):
+    """numba's own pipeline with one pass more and some less."""
 
-    lend = _LendCode
+    prepare = _PrepareCode
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.state.flags = _KnownFlags.of(self.state.flags)
+        self.state.typingctx = _Typing(self.state.typingctx)
 
     def define_pipelines(self):
         """Return the passes."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.add_pass_after(self.lend, NopythonTypeInference)
+        passes.passes = [entry for entry in passes.passes
+                         if entry[0].__name__ not in _NOT_NEEDED]
+        passes.add_pass_after(self.prepare, NopythonTypeInference)
         passes.finalize()
         return [passes]
 
 
-class _InnerCompiler(_LoopCompiler):
+class _LoopCompiler(_KernelCompiler):
+    """The same for code that is put into kernels."""
+
+    prepare = _LendCode
+
+
+class _InnerCompiler(_KernelCompiler):
     """The same for code that is not optimised."""
 
-    lend = _LendRawCode
+    prepare = _LendRawCode
 
 
 # The bits of a number, for exponentials.

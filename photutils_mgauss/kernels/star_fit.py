@@ -20,11 +20,11 @@ from photutils_mgauss.kernels.profile import (
     solve_factored,
 )
 from photutils_mgauss.kernels.star_normal import (
+    BoxScratch,
+    Equations,
     Pixels,
+    find_reach,
     gather,
-    largest_area,
-    make_equations,
-    make_scratch,
     normal_equations,
 )
 
@@ -78,6 +78,10 @@ class _Limits(NamedTuple):
     upper: np.ndarray
     fixed: np.ndarray
 
+    @classmethod
+    def empty(cls, size):
+        return cls(np.empty(size), np.empty(size), np.empty(size, bool))
+
 
 class _Work(NamedTuple):
     """
@@ -96,6 +100,42 @@ class _Work(NamedTuple):
     block: np.ndarray
     share: np.ndarray
     status: np.ndarray
+
+    @classmethod
+    def empty(cls, n):
+        size = 3 * n + 1
+        return cls(np.empty(size), np.empty(size), np.empty(size, bool),
+                   np.empty(size), np.empty((size, size)), np.empty(size),
+                   np.empty((3, size)), np.empty((3, 3)), np.empty(n),
+                   np.empty(n, np.int64))
+
+
+class FitScratch(NamedTuple):
+    """
+    The memory in which groups of stars are fitted.
+
+    The equations at the last point and, in boxes, those at the next one; the
+    numbers fitted, and what they are limited to.
+    """
+
+    boxes: BoxScratch
+    equations: Equations
+    work: _Work
+    limits: _Limits
+    parameters: np.ndarray
+
+    @classmethod
+    def empty(cls, stars, stop):
+        """
+        Return the memory for the largest group of some stars.
+
+        Once stop (1,) is True, fits end.
+        """
+        n = int(np.max(np.diff(stars.starts), initial=1))
+        boxes = BoxScratch.empty(n, stars.boxes, stop)
+        size = 3 * n + 1
+        return cls(boxes, Equations.empty(*boxes.data.shape, size),
+                   _Work.empty(n), _Limits.empty(size), np.empty(size))
 
 
 @inner
@@ -177,10 +217,11 @@ def _solve(parameters, equations, limits, n, size, work):
 
 
 @inner
-def _put_status(outcome, n, status):
-    """Give all stars of a group one outcome."""
+def _end(outcome, n, status, evaluations):
+    """Give all stars of a group one outcome; return the evaluations."""
     for s in range(n):
         status[s] = outcome
+    return evaluations
 
 
 @inner
@@ -223,6 +264,43 @@ def _keep(new, n, size, old):
 
 
 @inner
+def _begin(parameters, n, fit_sky, pixels, psf, scratch, work, equations,
+           chi2):
+    """Evaluate the first point of a group; return its sum of squares."""
+    for a in range(3 * n + fit_sky):
+        work.steepest[a] = 0.0
+    for s in range(n):
+        work.share[s] = np.inf
+    normal_equations(parameters, n, fit_sky, pixels, psf, scratch, equations,
+                     equations, chi2)
+    return chi2[1]
+
+
+@inner
+def _propose(parameters, equations, limits, n, size, work):
+    """
+    Put the next step, and its end, into work.
+
+    Returns by how much chi2 should fall, and the step's size.
+    """
+    _solve(parameters, equations, limits, n, size, work)
+    return (_expected(work.step, equations, size),
+            _step_size(work.step, parameters, equations.matrix, n))
+
+
+@inner
+def _accept(parameters, old, new, damping, n, size, work):
+    """Take the step; return its size, were it not damped."""
+    _share_fall(work.step, old, new, n, work.share)
+    if damping > 0:
+        _undamp(work.step, old.matrix, old.gradient, work.frozen, size)
+    length = _step_size(work.step, parameters, old.matrix, n)
+    copy_vector(work.trial, size, parameters)
+    _keep(new, n, size, old)
+    return length
+
+
+@inner
 def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
               limits, max_iterations, chi2):
     """
@@ -233,53 +311,33 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
     squares.
     """
     size = 3 * n + fit_sky
-    for a in range(size):
-        work.steepest[a] = 0.0
-    for s in range(n):
-        work.share[s] = np.inf
-    normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, old,
-                     chi2)
-    best = chi2[1]
+    best = _begin(parameters, n, fit_sky, pixels, psf, scratch, work, old,
+                  chi2)
     floor = 1e-24 * best
-    damping = 0.0
-    last = 0.0
-    fall = np.inf
+    damping, last, fall = 0.0, 0.0, np.inf
     for iteration in range(max_iterations):
         _freeze(parameters, limits, old.gradient, size, work.frozen)
         if not _factorize(old, damping, size, work, scratch.stop):
             damping = max(10 * damping, 1e-6)
             if damping > 1e3:
-                _put_status(_NOT_CONVERGED, n, work.status)
-                return iteration + 1
+                return _end(_NOT_CONVERGED, n, work.status, iteration + 1)
             continue
-        _solve(parameters, old, limits, n, size, work)
-        expected = _expected(work.step, old, size)
-        short = _step_size(work.step, parameters, old.matrix, n)
+        expected, short = _propose(parameters, old, limits, n, size, work)
         normal_equations(work.trial, n, fit_sky, pixels, psf, scratch, old,
                          new, chi2)
         if not chi2[0] <= best * (1 + 1e-12) + floor:
             if short < 1e-3 * STEP_TOLERANCE or damping > 1e12:
-                _put_status(STALLED, n, work.status)
-                return iteration + 2
-            damping = max(10 * damping, 1e-3)
-            last = 0.0
+                return _end(STALLED, n, work.status, iteration + 2)
+            damping, last = max(10 * damping, 1e-3), 0.0
             continue
-        _share_fall(work.step, old, new, n, work.share)
-        if damping > 0:
-            _undamp(work.step, old.matrix, old.gradient, work.frozen, size)
-        length = _step_size(work.step, parameters, old.matrix, n)
-        # Of a smaller fall nothing is left after rounding: keep the damping.
-        gain = ((best - chi2[0]) / expected if expected > 1e-9 * best
-                else POOR_GAIN)
+        length = _accept(parameters, old, new, damping, n, size, work)
         fall = best - chi2[0]
-        copy_vector(work.trial, size, parameters)
+        # Of a smaller fall nothing is left after rounding: keep the damping.
+        gain = fall / expected if expected > 1e-9 * best else POOR_GAIN
         best = chi2[1]
-        _keep(new, n, size, old)
         if remainder(length, last) < STEP_TOLERANCE:
-            _put_status(CONVERGED, n, work.status)
-            return iteration + 2
-        last = length
-        damping = next_damping(damping, gain)
+            return _end(CONVERGED, n, work.status, iteration + 2)
+        damping, last = next_damping(damping, gain), length
     _end_early(best, fall, n, work.share, work.status)
     return max_iterations + 1
 
@@ -377,15 +435,6 @@ def _scatter(sums, n_pixels, n_free):
 
 
 @inner
-def _most_stars(starts):
-    """Return the most stars of a group."""
-    most = 1
-    for g in range(starts.size - 1):
-        most = max(most, starts[g + 1] - starts[g])
-    return most
-
-
-@inner
 def _put_results(parameters, sky_variance, factor, first, n, fit_sky, fits):
     """Put the values of a group and its scaled covariances into fits."""
     for s in range(n):
@@ -398,63 +447,57 @@ def _put_results(parameters, sky_variance, factor, first, n, fit_sky, fits):
             fits.sky[first + s, 1] = sqrt(factor * sky_variance)
 
 
-@inner(allocates=True)
-def _make_limits(size):
-    return _Limits(np.empty(size), np.empty(size), np.empty(size, np.bool_))
+@inner
+def _fit_group(image, stars, first, n, fixed, fit_sky, psf, max_iterations,
+               scratch, fits):
+    """Fit the n stars from first on; see `fit_stars`."""
+    boxes, old, work, limits, parameters = scratch
+    data, variance, new, around, chi2 = boxes
+    n_pixels = _load_group(image, stars, first, n, fixed, parameters, limits,
+                           data, variance)
+    if n_pixels < 0:
+        for s in range(first, first + n):
+            fits.outcome[s, 0] = BAD_ERROR
+        return
+    rows = slice(first, first + n)
+    pixels = Pixels(stars.boxes[rows], data, variance, image.gain)
+    evaluations = _minimize(
+        parameters, n, fit_sky, pixels, psf, around, work, old, new, limits,
+        max_iterations, chi2)
+    sky_variance = _covariances(old, limits, n, 3 * n + fit_sky, work,
+                                around.stop, fits.covariances[rows])
+    _measure_fit(stars.initial[rows], pixels.boxes, old, n, fits.sums[rows])
+    factor = 1.0
+    if image.error.size == 0 and image.gain == 0:
+        factor = _scatter(fits.sums[rows], n_pixels,
+                          _count_free(limits, 3 * n + fit_sky))
+    _put_results(parameters, sky_variance, factor, first, n, fit_sky, fits)
+    for s in range(n):
+        fits.outcome[first + s, 0] = work.status[s]
+        fits.outcome[first + s, 1] = evaluations
 
 
-@inner(allocates=True)
-def _make_work(n):
-    size = 3 * n + 1
-    return _Work(np.empty(size), np.empty(size), np.empty(size, np.bool_),
-                 np.empty(size), np.empty((size, size)), np.empty(size),
-                 np.empty((3, size)), np.empty((3, 3)), np.empty(n),
-                 np.empty(n, np.int64))
+@inner
+def _count_free(limits, size):
+    """Return how many numbers are fitted."""
+    n = 0
+    for a in range(size):
+        n += not limits.fixed[a]
+    return n
 
 
-@kernel(allocates=True)
-def fit_stars(image, stars, fixed, fit_sky, psf, max_iterations, stop, fits):
+@kernel
+def fit_stars(image, stars, fixed, fit_sky, psf, max_iterations, scratch,
+              fits):
     """
     Fit flux, x and y of groups of stars.
 
     fixed (3,) holds for all; fit_sky adds one level for each group. Without
-    errors the scatter of the residuals stands for them. If stop (1,) becomes
-    True, the rest is left as it is.
+    errors the scatter of the residuals stands for them. scratch is a
+    FitScratch; if its stop becomes True, the rest is left as it is.
     """
     starts = stars.starts
-    most, area = _most_stars(starts), largest_area(stars.boxes)
-    n_free = 0
-    for c in range(fixed.size):
-        n_free += not fixed[c]
-    size = 3 * most + 1
-    data, variance = np.empty((most, area)), np.empty((most, area))
-    old = make_equations(most, area, size)
-    new = make_equations(most, area, size)
-    scratch = make_scratch(most, area, psf, stop)
-    work, limits = _make_work(most), _make_limits(size)
-    parameters, chi2 = np.empty(size), np.empty(2)
+    find_reach(psf, scratch.boxes.around.sight)
     for g in range(starts.size - 1):
-        first, n = starts[g], starts[g + 1] - starts[g]
-        rows = slice(first, first + n)
-        n_pixels = _load_group(image, stars, first, n, fixed, parameters,
-                               limits, data, variance)
-        if n_pixels < 0:
-            for s in range(first, first + n):
-                fits.outcome[s, 0] = BAD_ERROR
-            continue
-        pixels = Pixels(stars.boxes[rows], data, variance, image.gain)
-        evaluations = _minimize(
-            parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
-            limits, max_iterations, chi2)
-        sky_variance = _covariances(old, limits, n, 3 * n + fit_sky, work,
-                                    stop, fits.covariances[rows])
-        _measure_fit(stars.initial[rows], pixels.boxes, old, n,
-                     fits.sums[rows])
-        factor = 1.0
-        if image.error.size == 0 and image.gain == 0:
-            factor = _scatter(fits.sums[rows], n_pixels, n * n_free + fit_sky)
-        _put_results(parameters, sky_variance, factor, first, n, fit_sky,
-                     fits)
-        for s in range(n):
-            fits.outcome[first + s, 0] = work.status[s]
-            fits.outcome[first + s, 1] = evaluations
+        _fit_group(image, stars, starts[g], starts[g + 1] - starts[g], fixed,
+                   fit_sky, psf, max_iterations, scratch, fits)

@@ -68,6 +68,13 @@ class Equations(NamedTuple):
     gradient: np.ndarray
     first: np.ndarray
 
+    @classmethod
+    def empty(cls, n, area, size):
+        """Return equations of at most n stars and size parameters."""
+        return cls(np.zeros((n, area)), np.empty((n, area)),
+                   np.empty((size, size)), np.empty(size),
+                   np.empty(size, np.int64))
+
 
 class Tiling(NamedTuple):
     """What `fill_derivatives` works on."""
@@ -77,24 +84,60 @@ class Tiling(NamedTuple):
     index: np.ndarray
     weights: np.ndarray
 
+    @classmethod
+    def empty(cls, width):
+        """Return what derivatives in boxes of at most this width need."""
+        return cls(np.empty(4 * LANES), np.empty(3 * LANES * width),
+                   np.empty(4, np.int64), np.empty((3, 4)))
+
 
 class Scratch(NamedTuple):
     """
     The stars around one box, at most n.
 
     Their derivatives (n, 3, area), their numbers near (n,), and whether the
-    box is in their rows of the matrix, joined (n,). Stars are looked at
-    within reach of the box [pix], and joined if they are brighter than
-    least. stop (1,) is True once nobody waits for the result.
+    box is in their rows of the matrix, joined (n,). sight (2,) is how far
+    from the box stars are looked at [pix] and how bright they are to be
+    joined. stop (1,) is True once nobody waits for the result.
     """
 
     derivatives: np.ndarray
     near: np.ndarray
     joined: np.ndarray
     tiling: Tiling
-    reach: float
-    least: float
+    sight: np.ndarray
     stop: np.ndarray
+
+    @classmethod
+    def empty(cls, n, area, stop):
+        """Return scratch for at most n stars and area pixels."""
+        # A single star is always looked at.
+        return cls(np.empty((n, 3, area)), np.empty(n, np.int64),
+                   np.empty(n, bool), Tiling.empty(area), np.zeros(2), stop)
+
+
+class BoxScratch(NamedTuple):
+    """
+    The memory in which equations of at most n stars are made.
+
+    data and variance (n, area) of boxes of at most area pixels, the equations,
+    the stars around a box, and the sums of squares chi2 (2,).
+    """
+
+    data: np.ndarray
+    variance: np.ndarray
+    equations: Equations
+    around: Scratch
+    chi2: np.ndarray
+
+    @classmethod
+    def empty(cls, n, boxes, stop=None):
+        """Return the memory for groups of n stars among those of boxes."""
+        area = int(np.max(boxes[:, 2] * boxes[:, 3], initial=1))
+        stop = np.zeros(1, bool) if stop is None else stop
+        return cls(np.empty((n, area)), np.empty((n, area)),
+                   Equations.empty(n, area, 3 * n + 1),
+                   Scratch.empty(n, area, stop), np.zeros(2))
 
 
 @kernel
@@ -243,8 +286,8 @@ def _gaussian_reach(row):
 
 
 @inner
-def find_reach(psf):
-    """Return how far stars are seen [pix], and what is too faint to join."""
+def find_reach(psf, sight):
+    """Put how far stars are seen [pix] and what is too faint to join."""
     nodes, _, _, _, integrated = psf
     reach = 0.0
     peak = 0.0
@@ -254,9 +297,8 @@ def find_reach(psf):
             reach = max(reach, _gaussian_reach(nodes[m, k]))
             total += abs(nodes[m, k, 0])
         peak = max(peak, total)
-    if integrated:
-        return reach + _PIXEL, _FAINT * min(peak, 1.0)
-    return reach, _FAINT * peak
+    sight[0] = reach + _PIXEL if integrated else reach
+    sight[1] = _FAINT * (min(peak, 1.0) if integrated else peak)
 
 
 @inner
@@ -282,7 +324,7 @@ def _model_stars(parameters, n, own, box, psf, scratch, residual):
         residual[i] = 0.0
     for s in range(n):
         x, y = parameters[3 * s + 1], parameters[3 * s + 2]
-        if s != own and not _is_near(x, y, box, scratch.reach):
+        if s != own and not _is_near(x, y, box, scratch.sight[0]):
             continue
         derivatives = scratch.derivatives[count, :, :residual.size]
         fill_derivatives(x, y, box, psf, scratch.tiling, derivatives)
@@ -293,7 +335,7 @@ def _model_stars(parameters, n, own, box, psf, scratch, residual):
             top = max(top, abs(derivatives[0, i]))
         if top > _UNSEEN:
             scratch.near[count] = s
-            scratch.joined[count] = s == own or top > scratch.least
+            scratch.joined[count] = s == own or top > scratch.sight[1]
             count += 1
     return count
 
@@ -372,48 +414,12 @@ def normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
                          new)
 
 
-# Room to work in.
-
-@inner(allocates=True)
-def make_tiling(width):
-    """Return what derivatives in boxes of at most this width need."""
-    return Tiling(np.empty(4 * LANES), np.empty(3 * LANES * width),
-                  np.empty(4, np.int64), np.empty((3, 4)))
-
-
-@inner(allocates=True)
-def make_equations(n, area, size):
-    """Return equations of at most n stars and size parameters."""
-    return Equations(np.zeros((n, area)), np.empty((n, area)),
-                     np.empty((size, size)), np.empty(size),
-                     np.empty(size, np.int64))
-
-
-@inner(allocates=True)
-def make_scratch(n, area, psf, stop):
-    """Return scratch for groups of at most n stars."""
-    # A single star is always looked at.
-    reach, least = find_reach(psf) if n > 1 else (0.0, 0.0)
-    return Scratch(np.empty((n, 3, area)), np.empty(n, np.int64),
-                   np.empty(n, np.bool_), make_tiling(area), reach, least,
-                   stop)
-
-
-@inner
-def largest_area(boxes):
-    """Return the most pixels of a box."""
-    area = 1
-    for s in range(boxes.shape[0]):
-        area = max(area, boxes[s, 2] * boxes[s, 3])
-    return area
-
-
 # Single stars.
 
-@kernel(allocates=True)
-def star_derivatives(x_0, y_0, box, psf, out):
+@kernel
+def star_derivatives(x_0, y_0, box, psf, tiling, out):
     """Put the unit-flux PSF in a box, d/dx_0 and d/dy_0 into out (3, n)."""
-    fill_derivatives(x_0, y_0, box, psf, make_tiling(box[3]), out)
+    fill_derivatives(x_0, y_0, box, psf, tiling, out)
 
 
 class SingleEquations(NamedTuple):
@@ -441,25 +447,21 @@ def _put_star(new, chi2, i, out):
             out.matrices[i, b, a] = new.matrix[a, b]
 
 
-@kernel(allocates=True)
-def star_equations(image, boxes, parameters, psf, out):
+@kernel
+def star_equations(image, boxes, parameters, psf, scratch, out):
     """
     Evaluate stars, each by itself; parameters (n, 3) are flux, x and y.
 
-    Those without pixels contribute nothing.
+    Those without pixels contribute nothing. scratch is a BoxScratch.
     """
-    area = largest_area(boxes)
-    data, variance = np.empty((1, area)), np.empty((1, area))
-    new = make_equations(1, area, 3)
-    scratch = make_scratch(1, area, psf, np.zeros(1, np.bool_))
-    chi2 = np.zeros(2)
+    data, variance, new, around, chi2 = scratch
     for i in range(boxes.shape[0]):
         _clear(new, 1, 3)
         chi2[1] = 0.0
         n_pixels = gather(image, boxes[i], 0.0, data[0], variance[0])
         if n_pixels > 0:
             pixels = Pixels(boxes[i:i + 1], data, variance, 0.0)
-            normal_equations(parameters[i], 1, False, pixels, psf, scratch,
+            normal_equations(parameters[i], 1, False, pixels, psf, around,
                              new, new, chi2)
         out.n_pixels[i] = n_pixels
         _put_star(new, chi2[1], i, out)

@@ -305,8 +305,9 @@ class Fits:
 
 def _fit_chunk(image, psf, fit_sky, max_iterations, stop, stars):
     fits = Fits.empty(len(stars.initial))
+    scratch = kernels.FitScratch.empty(stars, stop)
     kernels.fit_stars(image, stars.arrays, stars.fixed, bool(fit_sky), psf,
-                      max_iterations, stop, fits.arrays)
+                      max_iterations, scratch, fits.arrays)
     return fits
 
 

@@ -362,6 +362,7 @@ class _Images:
             np.empty(n), np.empty((n, 3, 3)), np.empty((n, 3)),
             np.empty(n, np.int64))
         kernels.star_equations(image, self.boxes[k], values, self.psfs[k],
+                               kernels.BoxScratch.empty(1, self.boxes[k]),
                                single)
         if (single.n_pixels < 0).any():
             msg = ('images must have positive and finite errors under the '

@@ -267,7 +267,8 @@ class _StarDerivatives:
     def star(self, i, box):
         """Return the derivatives (3, pixels) of star i in a box."""
         out = np.empty((3, box[2] * box[3]))
-        kernels.star_derivatives(self.x[i], self.y[i], box, self.psf, out)
+        kernels.star_derivatives(self.x[i], self.y[i], box, self.psf,
+                                 kernels.Tiling.empty(box[3]), out)
         return out
 
     def own(self, i):

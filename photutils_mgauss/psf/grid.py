@@ -16,7 +16,6 @@ import numpy as np
 from astropy.table import QTable
 from scipy.optimize import linear_sum_assignment
 
-from photutils_mgauss import kernels
 from photutils_mgauss.psf.mixture import GaussianMixture, _check_covariances
 from photutils_mgauss.psf.rows import integrals, kernel_rows, of_integrals
 from photutils_mgauss.utils.validation import as_floats
@@ -92,11 +91,15 @@ class Grid:
 
     def neighbours(self, x, y):
         """Return the indices and bilinear weights (4,) at a position."""
-        index, weights = np.empty(4, np.int64), np.empty((3, 4))
-        kernels.blend_weights(float(x), float(y), self.x_grid, self.y_grid,
-                              index, weights)
-        used = weights[0] > 0
-        return index[used], weights[0, used]
+        i, fx = cells(np.atleast_1d(x), self.x_grid)
+        j, fy = cells(np.atleast_1d(y), self.y_grid)
+        columns = np.append(i, np.minimum(i + 1, self.x_grid.size - 1))
+        rows = np.append(j, np.minimum(j + 1, self.y_grid.size - 1))
+        index = (rows[:, None] * self.x_grid.size + columns).ravel()
+        weights = np.outer(np.append(1 - fy, fy),
+                           np.append(1 - fx, fx)).ravel()
+        used = weights > 0
+        return index[used], weights[used]
 
     def is_outside(self, x, y):
         """Tell which positions are outside the outermost nodes."""
@@ -298,6 +301,16 @@ def _blend_matched(near, share, stack):
         array[used] = value
     blended[0][~used] = 0
     return blended
+
+
+def cells(position, nodes):
+    """Return the cell of each position and the fraction of it passed."""
+    if nodes.size == 1:
+        return np.zeros(position.size, int), np.zeros(position.size)
+    cell = np.searchsorted(nodes, position, side='right') - 1
+    cell = np.clip(cell, 0, nodes.size - 2)
+    passed = (position - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
+    return cell, np.clip(passed, 0, 1)
 
 
 def checked_arrays(x, y, weights, means, covariances, scales):

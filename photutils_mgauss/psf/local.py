@@ -11,23 +11,13 @@ import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.base import PSFModel
-from photutils_mgauss.psf.grid import match
+from photutils_mgauss.psf.grid import cells, match
 from photutils_mgauss.psf.rows import kernel_rows, strides
 
 MAX_WING = 60
 # A cell's families are merged if that changes no pixel by more than this
 # fraction of the peak.
 _MERGE_TOLERANCE = 1e-3
-
-
-def cells(position, nodes):
-    """Return the cell of each position and the fraction of it passed."""
-    if nodes.size == 1:
-        return np.zeros(position.size, int), np.zeros(position.size)
-    cell = np.searchsorted(nodes, position, side='right') - 1
-    cell = np.clip(cell, 0, nodes.size - 2)
-    passed = (position - nodes[cell]) / (nodes[cell + 1] - nodes[cell])
-    return cell, np.clip(passed, 0, 1)
 
 
 @dataclass(frozen=True)
