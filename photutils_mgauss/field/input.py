@@ -163,7 +163,7 @@ def allow_for_correlation(sample):
     """
     if not any(sample.correlations):
         return
-    width = stages.first_width(sample)
+    width = stages.stacked_width(sample.stamps)
     sample.growth[:] = [1 if one is None else one.growth(width)
                         for one in sample.correlations]
     factor = sample.growth[sample.exposure][:, None, None]

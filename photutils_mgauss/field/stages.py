@@ -99,8 +99,15 @@ def first_width(problem):
 
     That of the PSF in pixels, or of the optics where these are fitted.
     """
-    data, good = problem.stamps.data, problem.stamps.good
-    inner = problem.stamps.offsets() <= 2.5
+    width = stacked_width(problem.stamps)
+    return (np.sqrt(width**2 - PIXEL_VARIANCE) if problem.pixel_integrated
+            else width)
+
+
+def stacked_width(stamps):
+    """Estimate the standard deviation of the PSF in pixels from stars."""
+    data, good = stamps.data, stamps.good
+    inner = stamps.offsets() <= 2.5
     light = np.where(good, data, 0)[:, inner].sum(axis=1)
     bright = light > 0
     shares = np.where(good, data, np.nan)[bright]
@@ -108,14 +115,12 @@ def first_width(problem):
     usable = good[bright].any(axis=0)
     stack = np.zeros(usable.shape)
     stack[usable] = np.nanmedian(shares[:, usable], axis=0)
-    order = np.argsort(problem.stamps.offsets(), axis=None)
-    radius = problem.stamps.offsets().ravel()[order]
+    order = np.argsort(stamps.offsets(), axis=None)
+    radius = stamps.offsets().ravel()[order]
     growth = np.cumsum(stack.ravel()[order])
     half = radius[np.argmax(growth >= 0.5 * growth.max())]
     # Half the light of a Gaussian is inside 1.18 standard deviations.
-    width = max(half, 0.7) / 1.18
-    return (np.sqrt(width**2 - PIXEL_VARIANCE) if problem.pixel_integrated
-            else width)
+    return max(half, 0.7) / 1.18
 
 
 def ladder(n_components, width):
