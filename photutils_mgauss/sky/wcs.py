@@ -67,14 +67,20 @@ def pixel_to_vectors(wcs, x, y, *, bounded=True):
     return np.asarray(sky.cartesian.xyz.value)
 
 
-def pixel_jacobian(wcs, plane, x, y):
-    """Return d(plane)/d(pixel), shape (2, 2, n) [mas/pix]."""
+def pixel_jacobian(wcs, plane, x, y, turn=None):
+    """
+    Return d(plane)/d(pixel), shape (2, 2, n) [mas/pix].
+
+    ``turn`` (3, 3) is a rotation of the sphere between the two, if any.
+    """
     columns = []
     for dx, dy in ((STEP, 0), (0, STEP)):
         after, before = (
-            plane.project(pixel_to_vectors(wcs, x + sign * dx, y + sign * dy,
-                                           bounded=False))
-            for sign in (1, -1))
+            pixel_to_vectors(wcs, x + sign * dx, y + sign * dy,
+                             bounded=False) for sign in (1, -1))
+        if turn is not None:
+            after, before = turn @ after, turn @ before
+        after, before = plane.project(after), plane.project(before)
         columns.append((after - before) / (2 * STEP))
     return np.stack(columns, axis=1)
 
