@@ -7,7 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numba.core.registry import cpu_target
 
 import photutils_mgauss
 from photutils_mgauss import kernels
@@ -166,3 +168,48 @@ print([name for name, kernel in jit.KERNELS.items() if not kernel.signatures])
     found = subprocess.run([sys.executable, '-c', code], check=True,
                            capture_output=True, text=True)
     assert found.stdout == '[]\n'
+
+
+def _doubled(x, n):
+    return x * 2 + n
+
+
+def _doubled_and_more(x, n):
+    return doubled(x, n) + doubled(x, 1)
+
+
+def _fill(values):
+    for i in range(values.size):
+        values[i] = more(values[i], 3) + doubled(values[i], i)
+
+
+doubled = jit.inner(_doubled)
+more = jit.inner(_doubled_and_more)
+fill = jit.kernel(_fill)
+# Neither the package's own nor kept.
+jit.KERNELS.pop('_fill', None)
+fill._cache = jit._NotKept()
+
+
+@pytest.fixture(scope='module')
+def filled():
+    values = np.arange(5.0)
+    fill(values)
+    return values
+
+
+def test_a_kernel_finds_inner_functions_of_inner_functions(filled):
+    x = np.arange(5.0)
+    assert filled.tolist() == (6 * x + 4 + x).tolist()
+
+
+@pytest.mark.skipif(not hasattr(doubled, 'signatures'),
+                    reason='numba is switched off')
+def test_constants_as_arguments_make_no_versions_of_their_own(filled):
+    assert len(doubled.signatures) == len(more.signatures) == 1
+
+
+def test_remembered_signatures_are_those_that_numba_finds(filled):
+    context = cpu_target.typing_context
+    for (function, args), signature in jit._SIGNATURES.items():
+        assert context.resolve_function_type(function, args, {}) == signature
