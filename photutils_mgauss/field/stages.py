@@ -4,6 +4,7 @@ The course of a field fit: start, weights, rejection, degree after degree.
 Nothing here knows of images or tables; see `photutils_mgauss.field`.
 """
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from astropy.stats import mad_std
@@ -118,20 +119,49 @@ def first_width(problem):
             else width)
 
 
-def ladder(n_components, width):
-    """Return shapes (K, 6) of concentric round Gaussians of growing size."""
+class Ladder(NamedTuple):
+    """
+    A start: what sizes, in units of the width, and weights go from and to.
+
+    offset is how far from the centre, in units of the size, each Gaussian
+    is, turn the direction of the first one [rad].
+    """
+
+    smallest: float
+    largest: float
+    offset: float
+    least: float
+    turn: float
+
+
+_PLAIN = Ladder(0.8, 3.5, 0.2, 0.05, 0.0)
+# Optics have many mixtures that are the best among their neighbours; which
+# of them is found depends on how many Gaussians share the core. Where pixels
+# hide the details, a poor one costs more than noise does.
+_LADDERS = tuple(
+    Ladder(*sizes, offset, least, turn) for turn in (0.0, 2.0)
+    for sizes, offset, least in (((0.8, 3.5), 0.2, 0.05),
+                                 ((0.5, 4.0), 0.2, 0.05),
+                                 ((0.7, 2.0), 0.5, 0.2)))
+# Stars and steps for a look at each, and the relative error of the PSF that
+# lets the cores decide.
+_LADDER_STARS, _LADDER_STEPS, _LADDER_ACCURACY = 25, 20, 0.02
+
+
+def ladder(n_components, width, start=_PLAIN):
+    """Return shapes (K, 6) of round Gaussians of growing size."""
     shapes = np.zeros((n_components, 6))
     if n_components == 1:
         sizes, weights = np.ones(1), np.ones(1)
     else:
-        sizes = np.geomspace(0.8, 3.5, n_components)
-        weights = np.geomspace(1, 0.05, n_components)
+        sizes = np.geomspace(start.smallest, start.largest, n_components)
+        weights = np.geomspace(1, start.least, n_components)
     shapes[:, 0] = np.log(weights)
     shapes[:, 3] = shapes[:, 5] = -np.log(sizes * width)
     # Gaussians of one centre only move apart if they start apart.
-    angle = 2.4 * np.arange(n_components)
-    shapes[:, 1] = 0.2 * width * sizes * np.cos(angle)
-    shapes[:, 2] = 0.2 * width * sizes * np.sin(angle)
+    angle = 2.4 * np.arange(n_components) + start.turn
+    shapes[:, 1] = start.offset * width * sizes * np.cos(angle)
+    shapes[:, 2] = start.offset * width * sizes * np.sin(angle)
     shapes[:, 1:3] -= shapes[0, 1:3]
     return shapes
 
@@ -147,12 +177,32 @@ def begin(problem, n_components, strength, workers):
     weigh(state, reject=False)
     advance(state, workers, tolerance=0.1)
     width = np.exp(-state.coefficients[0, 0, [3, 5]].mean())
-    shapes = ladder(n_components, width)
+    shapes, found = _best_ladder(state.problem, n_components, width, strength,
+                                 workers)
     mixture = _new_state(state.problem, shapes, width, strength)
+    mixture.coefficients[0] = found
     weigh(mixture, reject=False)
     advance(mixture, workers, max_steps=60, tolerance=0.05)
     mixture.prior.mean[0] = shapes
     return mixture.coefficients, shapes, width
+
+
+def _best_ladder(problem, n_components, width, strength, workers):
+    """Return the best of the starts, and the shapes (K, 6) it has led to."""
+    if n_components == 1 or not problem.pixel_integrated:
+        shapes = ladder(n_components, width)
+        return shapes, shapes
+    states = []
+    for start in _LADDERS:
+        few = problem.subset(np.arange(len(problem.basis))[:_LADDER_STARS])
+        state = _new_state(few, ladder(n_components, width, start), width,
+                           strength)
+        state.accuracy = _LADDER_ACCURACY
+        weigh(state, reject=False)
+        advance(state, workers, max_steps=_LADDER_STEPS, tolerance=0.3)
+        states.append(state)
+    best = min(states, key=lambda state: state.equations.chi2.sum())
+    return best.prior.mean[0], best.coefficients[0]
 
 
 def _new_state(problem, shapes, width, strength):
