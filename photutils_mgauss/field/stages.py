@@ -134,7 +134,7 @@ class Ladder(NamedTuple):
     turn: float
 
 
-_PLAIN = Ladder(0.8, 3.5, 0.2, 0.05, 0.0)
+PLAIN = Ladder(0.8, 3.5, 0.2, 0.05, 0.0)
 # Optics have many mixtures that are the best among their neighbours; which
 # of them is found depends on how many Gaussians share the core. Where pixels
 # hide the details, a poor one costs more than noise does.
@@ -148,7 +148,7 @@ _LADDERS = tuple(
 _LADDER_STARS, _LADDER_STEPS, _LADDER_ACCURACY = 25, 20, 0.02
 
 
-def ladder(n_components, width, start=_PLAIN):
+def ladder(n_components, width, start=PLAIN):
     """Return shapes (K, 6) of round Gaussians of growing size."""
     shapes = np.zeros((n_components, 6))
     if n_components == 1:
@@ -166,8 +166,15 @@ def ladder(n_components, width, start=_PLAIN):
     return shapes
 
 
-def begin(problem, n_components, strength, workers):
-    """Fit one round Gaussian, then the mixture, the same everywhere."""
+def begin(problem, n_components, strength, workers, ladders=None):
+    """
+    Fit one round Gaussian, then the mixture, the same everywhere.
+
+    The mixture starts from the best of ``ladders``; by default these are
+    several where pixels are integrated.
+    """
+    if ladders is None:
+        ladders = _LADDERS if problem.pixel_integrated else (PLAIN,)
     brightest = np.argsort(-problem.sources[:, 0, 2])[:_START_STARS]
     few = problem.subset(brightest)
     few.basis = np.ones((len(brightest), 1))
@@ -177,7 +184,8 @@ def begin(problem, n_components, strength, workers):
     weigh(state, reject=False)
     advance(state, workers, tolerance=0.1)
     width = np.exp(-state.coefficients[0, 0, [3, 5]].mean())
-    shapes, found = _best_ladder(state.problem, n_components, width, strength,
+    ladders = [ladder(n_components, width, start) for start in ladders]
+    shapes, found = _best_ladder(state.problem, ladders, width, strength,
                                  workers)
     mixture = _new_state(state.problem, shapes, width, strength)
     mixture.coefficients[0] = found
@@ -187,16 +195,14 @@ def begin(problem, n_components, strength, workers):
     return mixture.coefficients, shapes, width
 
 
-def _best_ladder(problem, n_components, width, strength, workers):
+def _best_ladder(problem, ladders, width, strength, workers):
     """Return the best of the starts, and the shapes (K, 6) it has led to."""
-    if n_components == 1 or not problem.pixel_integrated:
-        shapes = ladder(n_components, width)
-        return shapes, shapes
+    if len(ladders) == 1:
+        return ladders[0], ladders[0]
     states = []
-    for start in _LADDERS:
+    for shapes in ladders:
         few = problem.subset(np.arange(len(problem.basis))[:_LADDER_STARS])
-        state = _new_state(few, ladder(n_components, width, start), width,
-                           strength)
+        state = _new_state(few, shapes, width, strength)
         state.accuracy = _LADDER_ACCURACY
         weigh(state, reject=False)
         advance(state, workers, max_steps=_LADDER_STEPS, tolerance=0.3)
