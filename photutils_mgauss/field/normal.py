@@ -341,7 +341,10 @@ def optimise(problem, coefficients, prior, workers, *, max_steps=30,
 
 def _cost(problem, state, prior, coefficients):
     cost = state.chi2[problem.used].sum() + prior.cost(coefficients)
-    return cost if np.isfinite(cost) else np.inf
+    # Where Gaussians are too thin for their equations to be told from
+    # rounding, there is no next step.
+    diagonal = np.diag(state.matrix) + to_vector(prior.precision)
+    return cost if np.isfinite(cost) and np.all(diagonal > 0) else np.inf
 
 
 def _damped_step(matrix, right, damping):

@@ -22,9 +22,9 @@ _LOG = logging.getLogger('photutils_mgauss')
 # Narrower PSFs, their pixel included, are integrated [pix].
 _WELL_SAMPLED = 1.6
 # The Gaussians that the width is measured with.
-_COMPONENTS = 3
+_COMPONENTS = 2
 # The change of flux with pixel phase that is worth a word.
-_PHASE_ERROR = 0.002
+_PHASE_ERROR = 0.003
 
 
 def chosen_pixel(problem, pixel_integrated, strength, workers):
@@ -33,7 +33,8 @@ def chosen_pixel(problem, pixel_integrated, strength, workers):
         return pixel_integrated
     optics = replace(problem.subset(np.arange(len(problem.basis))),
                      pixel_integrated=True)
-    coefficients, _, _ = stages.begin(optics, _COMPONENTS, strength, workers)
+    coefficients, _, _ = stages.begin(optics, _COMPONENTS, strength, workers,
+                                      (stages.PLAIN,))
     width = full_width(coefficients[0], problem.stamps.radius)
     integrated = width < _WELL_SAMPLED
     _LOG.info('the PSF is %.2f pixels wide at half maximum, which is %s',

@@ -4,6 +4,7 @@ The course of a field fit: start, weights, rejection, degree after degree.
 Nothing here knows of images or tables; see `photutils_mgauss.field`.
 """
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from astropy.stats import mad_std
@@ -123,26 +124,62 @@ def stacked_width(stamps):
     return max(half, 0.7) / 1.18
 
 
-def ladder(n_components, width):
-    """Return shapes (K, 6) of concentric round Gaussians of growing size."""
+class Ladder(NamedTuple):
+    """
+    A start: what sizes, in units of the width, and weights go from and to.
+
+    offset is how far from the centre, in units of the size, each Gaussian
+    is, turn the direction of the first one [rad].
+    """
+
+    smallest: float
+    largest: float
+    offset: float
+    least: float
+    turn: float
+
+
+PLAIN = Ladder(0.8, 3.5, 0.2, 0.05, 0.0)
+# Optics have many mixtures that are the best among their neighbours; which
+# of them is found depends on how many Gaussians share the core. Where pixels
+# hide the details, a poor one costs more than noise does.
+_LADDERS = tuple(
+    Ladder(*sizes, offset, least, turn) for turn in (0.0, 2.0)
+    for sizes, offset, least in (((0.8, 3.5), 0.2, 0.05),
+                                 ((0.5, 4.0), 0.2, 0.05),
+                                 ((0.7, 2.0), 0.5, 0.2)))
+# Stars and steps for a look at each, and the relative error of the PSF that
+# lets the cores decide.
+_LADDER_STARS, _LADDER_STEPS, _LADDER_ACCURACY = 25, 20, 0.02
+
+
+def ladder(n_components, width, start=PLAIN):
+    """Return shapes (K, 6) of round Gaussians of growing size."""
     shapes = np.zeros((n_components, 6))
     if n_components == 1:
         sizes, weights = np.ones(1), np.ones(1)
     else:
-        sizes = np.geomspace(0.8, 3.5, n_components)
-        weights = np.geomspace(1, 0.05, n_components)
+        sizes = np.geomspace(start.smallest, start.largest, n_components)
+        weights = np.geomspace(1, start.least, n_components)
     shapes[:, 0] = np.log(weights)
     shapes[:, 3] = shapes[:, 5] = -np.log(sizes * width)
     # Gaussians of one centre only move apart if they start apart.
-    angle = 2.4 * np.arange(n_components)
-    shapes[:, 1] = 0.2 * width * sizes * np.cos(angle)
-    shapes[:, 2] = 0.2 * width * sizes * np.sin(angle)
+    angle = 2.4 * np.arange(n_components) + start.turn
+    shapes[:, 1] = start.offset * width * sizes * np.cos(angle)
+    shapes[:, 2] = start.offset * width * sizes * np.sin(angle)
     shapes[:, 1:3] -= shapes[0, 1:3]
     return shapes
 
 
-def begin(problem, n_components, strength, workers):
-    """Fit one round Gaussian, then the mixture, the same everywhere."""
+def begin(problem, n_components, strength, workers, ladders=None):
+    """
+    Fit one round Gaussian, then the mixture, the same everywhere.
+
+    The mixture starts from the best of ``ladders``; by default these are
+    several where pixels are integrated.
+    """
+    if ladders is None:
+        ladders = _LADDERS if problem.pixel_integrated else (PLAIN,)
     brightest = np.argsort(-problem.sources[:, 0, 2])[:_START_STARS]
     few = problem.subset(brightest)
     few.basis = np.ones((len(brightest), 1))
@@ -152,12 +189,31 @@ def begin(problem, n_components, strength, workers):
     weigh(state, reject=False)
     advance(state, workers, tolerance=0.1)
     width = np.exp(-state.coefficients[0, 0, [3, 5]].mean())
-    shapes = ladder(n_components, width)
+    ladders = [ladder(n_components, width, start) for start in ladders]
+    shapes, found = _best_ladder(state.problem, ladders, width, strength,
+                                 workers)
     mixture = _new_state(state.problem, shapes, width, strength)
+    mixture.coefficients[0] = found
     weigh(mixture, reject=False)
     advance(mixture, workers, max_steps=60, tolerance=0.05)
     mixture.prior.mean[0] = shapes
     return mixture.coefficients, shapes, width
+
+
+def _best_ladder(problem, ladders, width, strength, workers):
+    """Return the best of the starts, and the shapes (K, 6) it has led to."""
+    if len(ladders) == 1:
+        return ladders[0], ladders[0]
+    states = []
+    for shapes in ladders:
+        few = problem.subset(np.arange(len(problem.basis))[:_LADDER_STARS])
+        state = _new_state(few, shapes, width, strength)
+        state.accuracy = _LADDER_ACCURACY
+        weigh(state, reject=False)
+        advance(state, workers, max_steps=_LADDER_STEPS, tolerance=0.3)
+        states.append(state)
+    best = min(states, key=lambda state: state.equations.chi2.sum())
+    return best.prior.mean[0], best.coefficients[0]
 
 
 def _new_state(problem, shapes, width, strength):

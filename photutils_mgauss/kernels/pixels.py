@@ -57,6 +57,18 @@ def _edge(x, s, root, scale, n, t, ridge):
 
 
 @inner
+def _lay_nodes(low, height, q, nodes):
+    """Put the places and weights of a panel into nodes; return the largest."""
+    most = 0.0
+    for j in range(N_NODES):
+        t = low + (0.5 + NODES[j]) * height
+        nodes[0, j] = t
+        nodes[1, j] = NODE_WEIGHTS[j] * height * fast_exp(-0.5 * q * t * t)
+        most = max(most, nodes[1, j])
+    return most
+
+
+@inner
 def shape_integrals(dx, dy, p, s, q, nodes, edges, out):
     """
     Put a row of pixels and its derivatives into out (6, n).
@@ -71,14 +83,7 @@ def shape_integrals(dx, dy, p, s, q, nodes, edges, out):
     root = sqrt(0.5 * p)
     something = False
     for panel in range(panels):
-        middle = low + (panel + 0.5) * height
-        most = 0.0
-        for j in range(N_NODES):
-            t = middle + NODES[j] * height
-            nodes[0, j] = t
-            nodes[1, j] = NODE_WEIGHTS[j] * height * fast_exp(-0.5 * q * t * t)
-            most = max(most, nodes[1, j])
-        if most < _NO_RIDGE:
+        if _lay_nodes(low + panel * height, height, q, nodes) < _NO_RIDGE:
             continue
         if not something:
             something = True
@@ -112,3 +117,47 @@ def _differences(s, q, edges, out):
         by_p[i] = ug[i + 1] - ug[i]
         by_s[i] = tg[i] - tg[i + 1]
         by_q[i] = inside - q * (ttf[i + 1] - ttf[i])
+
+
+@sums
+def _edge_of_value(x, s, root, scale, n, t, ridge):
+    """Return the sums of F, t F and G, as `_edge`."""
+    f, tf, g = 0.0, 0.0, 0.0
+    for j in range(n):
+        z = root * (x - s * t[j])
+        value = fast_exp(-z * z)
+        beyond = value * erfc_over_exp(abs(z))
+        area = ridge[j] * (1 - beyond if z > 0 else beyond - 1)
+        f += area
+        tf += t[j] * area
+        g += ridge[j] * value
+    return scale * f, scale * tf, g
+
+
+@inner
+def add_integrals(a, dx, dy, p, s, q, by_x, by_y, nodes, width, step, out):
+    """
+    Add a row of pixels of a Gaussian and its slopes by x_0 and y_0 to out.
+
+    Value and slopes of pixel i are at i * step, and a third and two thirds of
+    step later. The Gaussian has the peak a, which changes by the shares by_x
+    and by_y; nodes (2, 8) is scratch.
+    """
+    low, height, panels = pixel_panels(dy, p, s, q)
+    root, scale = sqrt(0.5 * p), HALF_PI_ROOT / sqrt(p)
+    third = step // 3
+    for panel in range(panels):
+        if _lay_nodes(low + panel * height, height, q, nodes) < _NO_RIDGE:
+            continue
+        f, tf, g = _edge_of_value(dx - 0.5, s, root, scale, N_NODES,
+                                  nodes[0], nodes[1])
+        for i in range(width):
+            f_next, tf_next, g_next = _edge_of_value(
+                dx + i + 0.5, s, root, scale, N_NODES, nodes[0], nodes[1])
+            value, slope = a * (f_next - f), a * (g_next - g)
+            at = i * step
+            out[at] += value
+            out[at + third] += by_x * value - slope
+            out[at + 2 * third] += (by_y * value + s * slope
+                                    + a * q * (tf_next - tf))
+            f, tf, g = f_next, tf_next, g_next

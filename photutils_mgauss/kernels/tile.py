@@ -11,6 +11,7 @@ from photutils_mgauss.kernels.gaussian import (
 from photutils_mgauss.kernels.grid import blend_weights
 from photutils_mgauss.kernels.jit import inner, loop
 from photutils_mgauss.kernels.linear import clear
+from photutils_mgauss.kernels.pixels import N_NODES, add_integrals
 
 # The PSF of a star and its derivatives by position are summed in a tile, one
 # flat array: for each pixel column LANES values of the PSF, as many of its
@@ -87,14 +88,13 @@ def _add_walk(p, s, fall, width, walk, tile):
 
 
 @inner
-def _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height, width,
-                tile):
+def _add_points(a, dx, dy, p, s, q, by_x, by_y, height, width, tile):
     """Add a Gaussian to a tile, each pixel for itself."""
     for i in range(width):
         for j in range(height):
             u, v = dx + i, dy + j
-            g = a * point_value(u, v, p, s, q, integrated)
-            gx, gy = point_gradient(u, v, p, s, q, integrated)
+            g = a * point_value(u, v, p, s, q, False)
+            gx, gy = point_gradient(u, v, p, s, q, False)
             k = 3 * LANES * i + j
             tile[k] += g
             tile[k + LANES] += by_x * g - a * gx
@@ -114,9 +114,14 @@ def add_gaussian(a, dx, dy, p, s, q, stride, by_x, by_y, integrated, height,
     # A walk that begins too far out begins at zero.
     steep = (p > 50 or q > 50 or p * abs(s) * height > 200
              or (left < 0 and p * left * left > 600))
-    if integrated or steep:
-        _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height,
-                    width, tile)
+    if integrated:
+        # There is no walk, so its memory is free.
+        nodes = walk[:2 * N_NODES].reshape((2, N_NODES))
+        for j in range(height):
+            add_integrals(a, dx, dy + j, p, s, q, by_x, by_y, nodes, width,
+                          3 * LANES, tile[j:])
+    elif steep:
+        _add_points(a, dx, dy, p, s, q, by_x, by_y, height, width, tile)
     elif _walk_starts(a, dx - s * dy, dy, p, s, q, stride, by_x, by_y, height,
                       walk):
         _add_walk(p, s, stride[3], width, walk, tile)
