@@ -1,5 +1,5 @@
 """
-Are stated errors right if the PSF is from few stars, or noise correlated?
+Errors of stars with a PSF from few stars, and with correlated noise.
 
     python tests/benchmarks/bench_psf_errors.py [--harness DIR --optics FILE]
         [--stars 150 30 15 8] [--pairs 30 12] [--kernels bilinear drizzle]

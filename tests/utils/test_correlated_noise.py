@@ -1,4 +1,4 @@
-"""Correlated noise: measured on blank sky, and put into the errors of stars."""
+"""Correlated noise: measured on blank sky, put into the errors of stars."""
 import numpy as np
 import pytest
 from astropy.table import Table
