@@ -179,11 +179,11 @@ class CrowdedMixturePhotometry:
     fit pixels; ``neighbor_distance`` [pix] and ``neighbor_correlation``, the
     correlation with the nearest neighbour's flux; ``iter_detected``. Bits of
     ``flags`` beside photutils' own: 65536, most of the star is masked, as of
-    saturated ones; 131072, a blend, the correlation is beyond 0.5; 262144, not a star: part of
-    something extended, or something else is under it. Of a given list, also:
-    524288, no significant star is here, its flux has fewer than ``keep``
-    standard errors; 1048576, a repeat:
-    another entry means the same star, whose row this one shows again.
+    saturated ones; 131072, a blend, the correlation is beyond 0.5; 262144, not
+    a star: part of something extended, or something else is under it. Of a
+    given list, also: 524288, no significant star is here, its flux has fewer
+    than ``keep`` standard errors; 1048576, a repeat: another entry means the
+    same star, whose row this one shows again.
 
     Examples
     --------
