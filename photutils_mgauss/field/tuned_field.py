@@ -109,6 +109,11 @@ class TunedMixtureField(Field):
         -------
         (6,) `~numpy.ndarray`
             In the order of ``coefficients``.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a position is not a finite number.
         """
         x, y = as_real(x, 'x'), as_real(y, 'y')
         return (self._basis([x], [y]) @ self.coefficients)[0]
@@ -147,6 +152,11 @@ class TunedMixtureField(Field):
         GaussianMixture
             Of as many Gaussians as ``start`` has there. It contains the
             pixel.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a position is not a finite number.
         """
         x, y = as_real(x, 'x'), as_real(y, 'y')
         return GaussianMixture(*(array[0] for array in self._mixtures(
