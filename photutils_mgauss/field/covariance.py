@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from photutils_mgauss.field.base import covariance_of, lattice
+from photutils_mgauss.field.base import covariance_of
 from photutils_mgauss.field.normal import Workers, equations, to_vector
 from photutils_mgauss.psf.errors import PSFErrors, responses
 from photutils_mgauss.psf.grid import Grid
@@ -222,15 +222,16 @@ def psf_errors(at, covariance, unmodelled, degree, shape, integrated):
     -------
     PSFErrors
     """
-    # The covariance is a polynomial of twice the degree.
-    n = max(2 * degree + 1, 5) if degree else 1
-    n_nodes = tuple(min(n, size) for size in shape)
-    x, y = lattice(n_nodes, shape)
+    # The covariance is a polynomial of twice the degree. Each place stands for
+    # the cell in the middle of which it is.
+    n = max(2 * degree + 1, 7) if degree else 1
+    axes = [(np.arange(n) + 0.5) * size / n - 0.5 for size in shape[::-1]]
+    x, y = (axis.ravel() for axis in np.meshgrid(*axes))
     zero = np.zeros(unmodelled.size)
     basis, *mixtures = at(x, y, zero)
     every = np.stack([_slopes(at, x, y, step) for step in
                       _STEP * np.eye(unmodelled.size)], axis=1)
-    grid = Grid(np.unique(x), np.unique(y), *mixtures, np.ones(x.size))
+    grid = Grid(*axes, *mixtures, np.ones(x.size))
     found = shape_covariance(covariance, unmodelled, basis)
     return PSFErrors(grid, _directions(PSFErrors(grid, every), found,
                                        integrated))

@@ -107,6 +107,11 @@ class TunedMixtureField(Field):
         -------
         (6,) `~numpy.ndarray`
             In the order of ``coefficients``.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a position is not a finite number.
         """
         x, y = as_real(x, 'x'), as_real(y, 'y')
         return (self._basis([x], [y]) @ self.coefficients)[0]
@@ -145,6 +150,11 @@ class TunedMixtureField(Field):
         GaussianMixture
             Of as many Gaussians as ``start`` has there. It contains the
             pixel, unless the field is ``pixel_integrated``.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a position is not a finite number.
         """
         x, y = as_real(x, 'x'), as_real(y, 'y')
         known = known_shapes(self.start, [x], [y], self.pixel_integrated)

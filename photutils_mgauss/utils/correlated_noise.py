@@ -30,8 +30,9 @@ _FEWEST_PAIRS = 2000
 # and pixels around them, are light that nobody has listed.
 _SIDES, _LIGHT = (1, 3, 7), 3.5
 # A correlation counts if it is beyond so many of its standard errors, and the
-# mean one of the nearest pixels is so large: 0.02 makes an error 4 % larger.
-_SIGNIFICANT, _LEAST = 5.0, 0.02
+# mean one of the nearest pixels is so large. Resampling makes 0.3 and more;
+# what is below 0.1, light that nobody has listed may have made.
+_SIGNIFICANT, _LEAST = 5.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Correlated noise: measured on blank sky, and put into errors of stars."""
+"""Correlated noise: measured on blank sky, put into the errors of stars."""
 import numpy as np
 import pytest
 from astropy.table import Table
@@ -73,7 +73,7 @@ def test_padding_and_masks_are_no_blank_sky():
 
 def test_light_without_noise_is_no_correlated_noise():
     table = stars()[:5]
-    clean = sum(MIXTURE.render(SHAPE, *star) for star in stars())
+    clean = sum(MIXTURE.render(SHAPE, x, y, flux=f) for x, y, f in stars())
     assert noise_correlation(clean, np.ones(SHAPE), NO_MASK, table['x'],
                              table['y'], 9) is None
 
@@ -169,8 +169,8 @@ def test_fields_take_the_correlation_into_account():
         field = fit_mixture_field(data, table, **options)
     plain = fit_mixture_field(data, table, correlated_noise=False, **options)
     assert np.trace(field.covariance) > np.trace(plain.covariance)
-    assert_allclose(np.median(field.stars['reduced_chi2']),
-                    np.median(plain.stars['reduced_chi2']), rtol=0.1)
+    # Of the errors as they were given.
+    assert 0.9 < np.median(field.stars['reduced_chi2']) < 1.6
 
 
 def test_without_errors_nothing_is_looked_for():
