@@ -35,7 +35,7 @@ _OWN_SKY = 2
 # stars; the PSF is known no better than the least and no worse than the most.
 _CAUTION, _LEAST_ERROR, _MOST_ERROR = 2.0, 0.01, 0.3
 # 'auto' goes up to this degree, with so many stars for each term.
-_TOP_DEGREE, _STARS_PER_TERM = 4, 8
+_TOP_DEGREE, _STARS_PER_TERM = 4, 40
 # The PSF has come to rest when it changes by less than this from one pass to
 # the next, as a fraction, or by more than this part of the change before.
 _REST, _STALL = 1e-3, 0.7

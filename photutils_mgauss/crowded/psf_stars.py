@@ -33,7 +33,7 @@ class Rules:
     """
 
     radius: float = 15
-    max_stars: int = 200
+    max_stars: int = 300
     min_snr: float = 50
     given: np.ndarray | None = None
 
