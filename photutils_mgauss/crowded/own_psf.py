@@ -102,7 +102,7 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
     >>> psf = GaussianMixture([1], [[0, 0]], [[[1.0, 0.2], [0.2, 0.8]]])
     >>> rng = np.random.default_rng(1)
     >>> x, y = rng.uniform(0, 99, (2, 400))
-    >>> flux = 300 * rng.pareto(1, 400) + 100
+    >>> flux = 1000 * rng.pareto(1, 400) + 300
     >>> light = sum(psf.render((100, 100), *star, flux=f)
     ...             for *star, f in zip(x, y, flux))
     >>> error = np.sqrt(light + 20)

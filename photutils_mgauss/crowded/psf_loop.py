@@ -174,7 +174,8 @@ def _solve_window(data, variance, psf, gain, solve, options):
 def _in_image(table, window):
     """Return stars in image pixels, with their distance to the border."""
     out = {name: np.asarray(table[name])
-           for name in ('flux_fit', 'flux_err', 'crowding', 'flags')}
+           for name in ('flux_fit', 'flux_err', 'reduced_chi2', 'crowding',
+                        'flags')}
     margin = np.full(len(table), np.inf)
     for name, part in zip('xy', window[::-1], strict=True):
         place = np.asarray(table[f'{name}_fit'])
