@@ -14,7 +14,7 @@ __all__ = ['fit_crowded_psf']
 
 
 def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
-                    n_components=6, degree='auto', radius=15, max_stars=200,
+                    n_components=6, degree='auto', radius=15, max_stars=300,
                     min_snr=50, saturation=None, effective_gain=None,
                     background_size=64, max_passes=8, executor=None,
                     checkpoint=None, progress_bar=False):
@@ -48,8 +48,9 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
         The number K of Gaussians.
     degree : int or 'auto', optional
         The degree of the polynomials of the last pass, 0 for a PSF that is
-        the same everywhere. 'auto' is as high as there are eight stars for
-        each term, at most 4. Terms that the stars do not ask for are shrunk.
+        the same everywhere. 'auto' is as high as there are forty stars for
+        each term, at most 4: 2 with 300 stars, 3 with 400. Terms that the
+        stars do not ask for are shrunk.
     radius : float, optional
         The radius of the circle of pixels around each star that is fitted
         [pix].
@@ -101,7 +102,7 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
     >>> psf = GaussianMixture([1], [[0, 0]], [[[1.0, 0.2], [0.2, 0.8]]])
     >>> rng = np.random.default_rng(1)
     >>> x, y = rng.uniform(0, 99, (2, 400))
-    >>> flux = 300 * rng.pareto(1, 400) + 100
+    >>> flux = 1000 * rng.pareto(1, 400) + 300
     >>> light = sum(psf.render((100, 100), *star, flux=f)
     ...             for *star, f in zip(x, y, flux))
     >>> error = np.sqrt(light + 20)

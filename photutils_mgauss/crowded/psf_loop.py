@@ -35,7 +35,7 @@ _OWN_SKY = 2
 # stars; the PSF is known no better than the least and no worse than the most.
 _CAUTION, _LEAST_ERROR, _MOST_ERROR = 2.0, 0.01, 0.3
 # 'auto' goes up to this degree, with so many stars for each term.
-_TOP_DEGREE, _STARS_PER_TERM = 4, 8
+_TOP_DEGREE, _STARS_PER_TERM = 4, 40
 # The PSF has come to rest when it changes by less than this from one pass to
 # the next, as a fraction, or by more than this part of the change before.
 _REST, _STALL = 1e-3, 0.7
@@ -174,7 +174,8 @@ def _solve_window(data, variance, psf, gain, solve, options):
 def _in_image(table, window):
     """Return stars in image pixels, with their distance to the border."""
     out = {name: np.asarray(table[name])
-           for name in ('flux_fit', 'flux_err', 'crowding', 'flags')}
+           for name in ('flux_fit', 'flux_err', 'reduced_chi2', 'crowding',
+                        'flags')}
     margin = np.full(len(table), np.inf)
     for name, part in zip('xy', window[::-1], strict=True):
         place = np.asarray(table[f'{name}_fit'])

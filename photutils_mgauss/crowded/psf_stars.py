@@ -33,7 +33,7 @@ class Rules:
     """
 
     radius: float = 15
-    max_stars: int = 200
+    max_stars: int = 300
     min_snr: float = 50
     given: np.ndarray | None = None
 
@@ -104,13 +104,15 @@ def judge(table, variance, psf_error, rules):
     with np.errstate(all='ignore'):
         snr = flux / np.asarray(table['flux_err'], float)
         doubt = np.hypot(1 / snr, psf_error * (1 / own_light - 1))
+        # Errors grow with chi2, and that with what the PSF lacks as yet.
+        seen = snr * np.sqrt(np.fmax(table['reduced_chi2'], 1))
     flags = np.asarray(table['flags'])
     masked = _without_core(x, y, variance)
     reason = np.full(len(table), '', dtype='U9')
     for name, applies in (
             ('edge', np.asarray(table['margin']) < rules.radius),
             ('masked', masked | (flags & SATURATED > 0)),
-            ('faint', ~(snr >= rules.min_snr)),
+            ('faint', ~(seen >= rules.min_snr)),
             ('extended', flags & NOT_A_STAR > 0),
             ('blended', ~(own_light > _OWN_LIGHT))):
         reason[(reason == '') & applies] = name
@@ -120,7 +122,7 @@ def judge(table, variance, psf_error, rules):
     best = _even_choice(x[good], y[good], doubt[good], variance.shape,
                         rules.max_stars)
     reason[good[best]] = ''
-    return _candidates(table, snr, reason, rules)
+    return _candidates(table, seen, reason, rules)
 
 
 def _candidates(table, snr, reason, rules):

@@ -203,6 +203,11 @@ def stars_of_images():
             'flux': [1e4, 2e4], 'separation': 20, 'radius': .7,
             'flux_ratio': 2.5, 'flux_edges': [5e3, 5e4],
             'effective_gain': 1.0, 'repeats': 1, 'rng': 1}),
+        'fit_crowded_psf': (mg.fit_crowded_psf, {
+            **pixels(), 'stars': stars(), 'n_components': 1, 'degree': 0,
+            'radius': 5, 'max_stars': 20, 'min_snr': 5.0, 'saturation': 1e9,
+            'effective_gain': 1.0, 'background_size': 32, 'max_passes': 6,
+            'checkpoint': None}),
         'fit_many': (mg.fit_many, {
             'images': [(image(), psf, wcs())], 'coordinates': places(),
             'fit_shape': 11}),
