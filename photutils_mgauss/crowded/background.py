@@ -5,7 +5,7 @@ from photutils_mgauss import kernels
 
 # How strongly neighbouring nodes are tied, in units of a node's information.
 _TIE = 1e-3
-_START_ROUNDS = 3
+_START_ROUNDS = 6
 
 
 class Mesh:

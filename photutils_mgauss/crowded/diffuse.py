@@ -48,7 +48,10 @@ class Diffuse:
         Returns by how much the levels of a mesh of wider nodes are to rise.
         """
         faint = self.mesh.faint_level(data, good, noise)
-        return self._take(faint, np.ones(faint.size), mesh, noise)
+        wide = self._take(faint, np.ones(faint.size), mesh, noise)
+        # Stars are under it yet: no more than what stands out is believed.
+        self.level = _beyond(self.level, noise)
+        return wide
 
     def update(self, residual, weight, mesh, noise):
         """Find the light in what stars and sky have left over; see `begin`."""
@@ -68,8 +71,7 @@ class Diffuse:
         wide = _node_means(mesh, x, y, level, information)
         self.level = self._smooth(level - mesh.at(x, y, wide), information)
         # The joint fit finds levels better, but not from far away.
-        return wide * np.maximum(
-            1 - (noise / np.maximum(np.abs(wide), 1e-9 * noise))**2, 0)
+        return _beyond(wide, noise)
 
     def _smooth(self, level, information):
         """Return what of blocks' levels is smooth, and significantly so."""
@@ -80,10 +82,14 @@ class Diffuse:
         for scale in _SCALES:
             mean, error = _local_mean(level - light, information, noise,
                                       scale)
-            strength = np.abs(mean) / error
-            light += mean * np.maximum(
-                1 - (_LEAST / np.maximum(strength, 1e-9))**2, 0)
+            light += _beyond(mean, _LEAST * error)
         return light.ravel()
+
+
+def _beyond(level, least):
+    """Return levels, smaller ones the less the nearer to the least of all."""
+    return level * np.maximum(
+        1 - (least / np.maximum(np.abs(level), 1e-9 * least))**2, 0)
 
 
 def _node_means(mesh, x, y, level, information):

@@ -21,7 +21,7 @@ _TOLERANCE = 1e-6
 _CG_STEPS = 400
 # Where stars are so many that together they can be a background, its steps
 # are to be small: this is added to the information of nodes, as a fraction.
-_LEVEL_DAMPING = 0.5
+_LEVEL_DAMPING = 0.1
 # What is known beforehand moves no flux by more standard errors than this.
 _STRONGEST_PULL = 0.5
 # Pixels further than this from the model take no part in the background.
