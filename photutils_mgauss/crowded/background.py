@@ -5,6 +5,7 @@ from photutils_mgauss import kernels
 
 # How strongly neighbouring nodes are tied, in units of a node's information.
 _TIE = 1e-3
+# So often the start of a sloping sky is looked for in what it leaves over.
 _START_ROUNDS = 6
 
 
@@ -76,7 +77,7 @@ class Mesh:
         return out.ravel()
 
     def means(self, weight, image):
-        """Return the means (n,) of an image over nodes' pixels, and weights."""
+        """Return means (n,) of an image over nodes' pixels, and weights."""
         total, seen = (self._per_node(part) for part in (weight * image,
                                                          weight))
         return np.divide(total, seen, where=seen > 0,
@@ -94,8 +95,9 @@ class Mesh:
         return image.ravel()
 
     def faint_level(self, data, good, noise):
-        """Return a level (n,) from each node's faint pixels."""
-        # Where stars leave no sky, the faintest pixels are nearest to it.
+        """Return a level (n,) from the faint good pixels of each node."""
+        # Where stars leave no sky, the faintest pixels are nearest to it: of
+        # noise alone one in a hundred is 2.3 standard deviations below.
         faintest, faint = self._percentiles(data, good, [1, 20])
         level = np.minimum(faint, faintest + 2.3 * noise)
         known = np.isfinite(level)

@@ -6,7 +6,7 @@ on as small a scale as it can be told from noise and from stars not found:
 on an even sky there is none.
 """
 import numpy as np
-from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.ndimage import convolve, gaussian_filter
 
 from photutils_mgauss.crowded.background import Mesh
 
@@ -21,6 +21,7 @@ _LEAST = 4.0
 # Pixels further than this from the light beneath them count for less.
 _HUBER = 1.5
 _ROUNDS = 3
+_ROUGH = np.outer([1, -2, 1], [1, -2, 1]) / 6
 
 
 class Diffuse:
@@ -102,9 +103,8 @@ def _node_means(mesh, x, y, level, information):
 
 def _noise(level, information):
     """Return the noise of blocks in units of what information says."""
-    rough = level - uniform_filter(level, 3)
-    # A block is a ninth of the mean that is subtracted.
-    square = information * rough**2 * 9 / 8
+    # Of curved light this leaves nothing, of noise all.
+    square = information * convolve(level, _ROUGH)**2
     known = (information > 0).astype(float)
     return gaussian_filter(square, _SCALES[0]) / np.maximum(
         gaussian_filter(known, _SCALES[0]), 1e-3)

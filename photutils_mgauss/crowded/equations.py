@@ -127,12 +127,13 @@ def _mesh_equations(model, stars):
     else:
         stars.coupling[:] = 0
         information = gradient = np.zeros(model.level.size)
-    # Nodes without pixels follow their neighbours.
+    # Nodes without pixels follow their neighbours, up and down the slopes
+    # there were at first.
     tie = float(mesh.tie / model.noise**2)
+    pull = tie * mesh.steepness(model.level - model.first_level)
     return kernels.MeshEquations(
-        information + tie * mesh.n_ties(),
-        gradient - tie * mesh.steepness(model.level), tie, mesh.shape[1],
-        *_own_node(mesh, model.stars))
+        information + tie * mesh.n_ties(), gradient - pull, tie,
+        mesh.shape[1], *_own_node(mesh, model.stars))
 
 
 def _own_node(mesh, stars):

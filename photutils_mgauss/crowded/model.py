@@ -46,7 +46,7 @@ class Model:
     ----------
     stars : Stars
     level : (m,) `~numpy.ndarray`
-        The background at the nodes of ``mesh``.
+        The background at the nodes of ``mesh``; ``first_level`` was the first.
     residual, weight : (ny, nx) `~numpy.ndarray`
         What the model leaves of the data, and inverse variances.
     stamps, gaussians : kernels.Stamps, kernels.Gaussians
@@ -75,10 +75,11 @@ class Model:
         # Stars hide the sky.
         self.diffuse = Diffuse(self.data.shape, origin)
         if not size:
-            self.level = np.zeros(self.mesh.size)
+            self.level = self.first_level = np.zeros(self.mesh.size)
             self.limits = -np.inf, np.inf
             return
         self.level = self.mesh.start(self.data, self.good, self.noise)
+        self.first_level = self.level.copy()
         self.limits = self.mesh.limits(self.data, self.good, self.noise)
         self.level += self.diffuse.begin(
             self.data - self.mesh.image(self.level), self.good, self.noise,

@@ -23,11 +23,13 @@ Stars with the flag of what is no star, or of saturation, count as not found.
 import argparse
 import time
 import warnings
+from dataclasses import replace
+from itertools import pairwise
 
 import crowded_light as light
 import numpy as np
 from astropy.table import Table
-from crowded_scores import MARGIN, Score, pair, scatter
+from crowded_scores import Score, pair, scatter
 
 from photutils_mgauss import CrowdedMixturePhotometry
 
@@ -79,13 +81,14 @@ def print_even(name, scene, table, seconds):
         width = np.column_stack([score.table[f'{c}_err'][row[found]]
                                  for c in 'xy'])
         off, flux_width, true = flux_error(score, found)
+        pull = off / flux_width
         print(f'{low}-{low + 1} {here.sum():5d}  '
               f'{scatter(error / scene.bound[found]):7.2f}  '
               f'{found.sum() / max(here.sum(), 1):8.1%}  '
               f'{(score.false & there).sum() / max(there.sum(), 1):6.1%}  '
               f'{-2.5 * np.log10(1 + np.median(off / true)):+8.4f}  '
               f'{scatter(error / width):7.2f}  '
-              f'{scatter(off / flux_width - np.median(off / flux_width)):6.2f}')
+              f'{scatter(pull - np.nanmedian(pull)):6.2f}')
 
 
 def even_part(args, psf):
@@ -103,11 +106,11 @@ def even_scene(args, psf, seed):
 
 def plane_part(args, psf):
     scene = even_scene(args, psf, args.seeds[0])
-    y, x = np.indices(scene.images['sci'].shape)
+    x = np.arange(scene.size)
     # The same errors: it is the answer to the same noise that is asked for.
     before, _ = reduce(psf, scene)
     scene.images['sci'] = scene.images['sci'] + 3 * x
-    after, seconds = reduce(psf, scene)
+    after, _ = reduce(psf, scene)
     print_plane(before, after, scene)
 
 
@@ -129,7 +132,6 @@ def print_plane(before, after, scene):
 
 def replace_truth(scene, table):
     """Return a scene whose truth is a list."""
-    from dataclasses import replace
     truth = table.copy()
     truth['mag'] = scene.magnitude(truth['flux'])
     return replace(scene, truth=truth)
@@ -162,7 +164,7 @@ def print_cluster(name, scene, centre, table, seconds):
           f'flagged, {seconds:.1f} CPU s, reduced_chi2 '
           f'{table.meta["reduced_chi2"]:.3f}\n stars/px   mag        n '
           'complete (flagged too)  bias  RMS/CRLB pull x, y  flux  false')
-    for low, high in zip(DENSITIES[:-1], DENSITIES[1:], strict=True):
+    for low, high in pairwise(DENSITIES):
         for m_low, m_high in ((17, 19), (19.5, 20.5), (21.5, 22.5)):
             here = (good.counted & (density >= low) & (density < high)
                     & (mag >= m_low) & (mag < m_high))
