@@ -4,8 +4,9 @@ All stars of a crowded image together, with its background.
 `photometry` has `CrowdedMixturePhotometry`; `plan` cuts the image into tiles,
 `solve` takes one tile from first search to last fit: `search` finds stars on
 the residual, `bright` treats saturated stars, `given` a list of the user's.
-A `tile` is a `model`, stars on the mesh of `background`, and the `equations`
-of its joint fit. `stars` has the one form that stars have from list or search
+A `tile` is a `model`, stars on the mesh of `background` and the light of
+`diffuse`, and the `equations` of its joint fit. `judge` tells stars from
+smooth light. `stars` has the one form that stars have from list or search
 to the table, and who is beside whom; `table` says what is reported of each.
 `psf_loop` makes the PSF of the image's own stars, which `psf_stars` chooses,
 for `own_psf`, that has `fit_crowded_psf`. `injection` has

@@ -19,6 +19,9 @@ _LEAST_CHANGE, _MOST_CHANGE = 0.2, 2.5
 # was: what is left over would depend on what else is on the tile.
 _TOLERANCE = 1e-6
 _CG_STEPS = 400
+# Where stars are so many that together they can be a background, its steps
+# are to be small: this is added to the information of nodes, as a fraction.
+_LEVEL_DAMPING = 0.1
 # What is known beforehand moves no flux by more standard errors than this.
 _STRONGEST_PULL = 0.5
 # Pixels further than this from the model take no part in the background.
@@ -49,10 +52,12 @@ class Equations:
         """Return the Gauss-Newton steps of the stars (n, 3) and the level."""
         stars = self.stars._replace(
             matrix=self.stars.matrix * (1 + damping * np.eye(3)))
+        mesh = self.mesh._replace(
+            diagonal=self.mesh.diagonal * (1 + _LEVEL_DAMPING))
         n = len(stars.matrix)
         step = np.zeros(3 * n + self.mesh.gradient.size)
         kernels.solve_joint(
-            stars, self.neighbours.pairs, self.mesh, _TOLERANCE, _CG_STEPS,
+            stars, self.neighbours.pairs, mesh, _TOLERANCE, _CG_STEPS,
             np.empty((n, 3, 3)), np.empty((4, step.size)), step)
         return step[:3 * n].reshape(n, 3), step[3 * n:]
 
@@ -114,19 +119,21 @@ def _mesh_equations(model, stars):
     if model.options.background_size:
         # All pixels count for the information: stars are coupled through
         # all of theirs. Those far from the model say nothing of the sky.
-        information, seen, total = mesh.sums(
-            model.weight, model.residual, model.background(),
+        # What is left over is to vanish, not to agree with the node: between
+        # nodes a peak of the background is lower.
+        information, _, gradient = mesh.sums(
+            model.weight, model.residual, np.zeros(model.residual.shape),
             _BACKGROUND_CLIP)
-        gradient = total - seen * model.level
     else:
         stars.coupling[:] = 0
         information = gradient = np.zeros(model.level.size)
-    # Nodes without pixels follow their neighbours.
+    # Nodes without pixels follow their neighbours, up and down the slopes
+    # there were at first.
     tie = float(mesh.tie / model.noise**2)
+    pull = tie * mesh.steepness(model.level - model.first_level)
     return kernels.MeshEquations(
-        information + tie * mesh.n_ties(),
-        gradient - tie * mesh.steepness(model.level), tie, mesh.shape[1],
-        *_own_node(mesh, model.stars))
+        information + tie * mesh.n_ties(), gradient - pull, tie,
+        mesh.shape[1], *_own_node(mesh, model.stars))
 
 
 def _own_node(mesh, stars):

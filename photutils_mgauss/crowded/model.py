@@ -15,6 +15,7 @@ import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.crowded.background import Mesh
+from photutils_mgauss.crowded.diffuse import Diffuse
 from photutils_mgauss.crowded.stars import Neighbours, Stars
 from photutils_mgauss.psf.local import MAX_WING
 
@@ -45,7 +46,7 @@ class Model:
     ----------
     stars : Stars
     level : (m,) `~numpy.ndarray`
-        The background at the nodes of ``mesh``.
+        The background at the nodes of ``mesh``; ``first_level`` was the first.
     residual, weight : (ny, nx) `~numpy.ndarray`
         What the model leaves of the data, and inverse variances.
     stamps, gaussians : kernels.Stamps, kernels.Gaussians
@@ -72,10 +73,17 @@ class Model:
         self.mesh = Mesh(self.data.shape, origin,
                          size or max(self.data.shape))
         # Stars hide the sky.
-        self.level = (self.mesh.faint_level(self.data, self.good) if size
-                      else np.zeros(self.mesh.size))
-        self.limits = (self.mesh.limits(self.data, self.good, self.noise)
-                       if size else (-np.inf, np.inf))
+        self.diffuse = Diffuse(self.data.shape, origin)
+        if not size:
+            self.level = self.first_level = np.zeros(self.mesh.size)
+            self.limits = -np.inf, np.inf
+            return
+        self.level = self.mesh.start(self.data, self.good, self.noise)
+        self.first_level = self.level.copy()
+        self.limits = self.mesh.limits(self.data, self.good, self.noise)
+        self.level += self.diffuse.begin(
+            self.data - self.mesh.image(self.level), self.good, self.noise,
+            self.mesh)
 
     def _put(self, stars):
         self.stars = stars
@@ -173,8 +181,21 @@ class Model:
                           self.residual)
 
     def background(self):
-        """Return the image of the background."""
-        return self.mesh.image(self.level)
+        """Return the image of the background, diffuse light included."""
+        return self.mesh.image(self.level) + self.diffuse.image()
+
+    def background_at(self, x, y):
+        """Return the background at positions (n,)."""
+        return (self.mesh.at(x, y, self.level)
+                + self.diffuse.mesh.at(x, y, self.diffuse.level))
+
+    def update_diffuse(self):
+        """Find again the diffuse light that stars and sky leave over."""
+        if self.options.background_size:
+            before = self.background()
+            self.level = self.level + self.diffuse.update(
+                self.residual, self.weight, self.mesh, self.noise)
+            self.residual += before - self.background()
 
     def star_light(self):
         """Return the image of the stars alone."""

@@ -18,14 +18,8 @@ _LEAST = 0.05
 # No star is added this close to another, or to one that was taken away [pix].
 _SEPARATION = 0.3
 _REJECTED = 0.5
-# Within this distance [pix], stars are too many to be stars if each has less
-# than this many times the PSF's own area, in which half a star's information
-# lies.
-_DENSITY_REACH = 6.0
-_OWN_AREA = 0.7
-# So often, what has most of its neighbours within twice that distance in
-# something extended counts as part of it, too.
-_SPREADING = 3
+# Stars whose light is on the image may be this far outside [pix].
+_OUTSIDE = 3.0
 
 
 def find(tile, threshold, found_in):
@@ -68,40 +62,7 @@ def _apart(tile, found):
     for places, limit in ((stars, _SEPARATION), (tile.rejected, _REJECTED)):
         if len(places) and len(found):
             apart &= cKDTree(places).query(positions)[0] > limit
-    return apart & ~too_dense(tile.model, found.x, found.y)
-
-
-def too_dense(model, x, y):
-    """Tell at which positions there are more stars than can be."""
-    s = model.stars
-    if not len(s) or not len(x):
-        return np.zeros(len(x), bool)
-    tree = cKDTree(np.column_stack([s.x, s.y]))
-    count = tree.query_ball_point(np.column_stack([x, y]),
-                                  _DENSITY_REACH, return_length=True)
-    # The part of the circle that is on the tile.
-    ny, nx = model.data.shape
-    part = [np.minimum(v + 0.5, _DENSITY_REACH)
-            + np.minimum(n - 0.5 - v, _DENSITY_REACH)
-            for v, n in ((x, nx), (y, ny))]
-    space = np.pi / 4 * np.prod(np.maximum(part, 1), axis=0)
-    return (count * model.psf.area * _OWN_AREA > space) & (count > 5)
-
-
-def extended(model):
-    """Tell which stars are where, and beside where, there are too many."""
-    s = model.stars
-    out = too_dense(model, s.x, s.y)
-    if not out.any():
-        return out
-    first, second = cKDTree(np.column_stack([s.x, s.y])).query_pairs(
-        2 * _DENSITY_REACH, output_type='ndarray').T
-    count = np.bincount(np.concatenate([first, second]), minlength=len(s))
-    for _ in range(_SPREADING):
-        beside = (np.bincount(first, out[second], len(s))
-                  + np.bincount(second, out[first], len(s)))
-        out |= (beside > 2) & (2 * beside > count)
-    return out
+    return apart
 
 
 def leave_out(tile, threshold):
@@ -117,12 +78,16 @@ def leave_out(tile, threshold):
     weak = ~(strength >= threshold) & ~s.listed
     near = np.hypot(s.x[p.owner] - s.x[p.neighbour],
                     s.y[p.owner] - s.y[p.neighbour]) < 2
-    rival = (near & weak[p.neighbour]
-             & (s.flux[p.neighbour] < s.flux[p.owner]))
-    weak[p.owner[rival]] = False
+    fainter = near & (s.flux[p.neighbour] < s.flux[p.owner])
+    weak[p.owner[fainter & weak[p.neighbour]]] = False
+    # Where equations have no solution it is not the brightest that is extra.
+    second = np.zeros(len(s), bool)
+    second[p.neighbour[fainter]] = True
+    weak &= second | ~np.isnan(strength) | ~(s.flux > 0)
     ny, nx = tile.model.data.shape
-    weak |= ~s.listed & ((s.x < -1) | (s.y < -1) | (s.x > nx)
-                         | (s.y > ny))
+    weak |= ~s.listed & (np.maximum(
+        np.maximum(-s.x, s.x - nx + 1),
+        np.maximum(-s.y, s.y - ny + 1)) > _OUTSIDE)
     gone = np.flatnonzero(weak)
     places = np.column_stack([s.x[gone], s.y[gone]])
     tile.dismiss(weak)

@@ -49,6 +49,7 @@ def _find_all(tile):
                 tile.step(0.05)
                 tile.note_widths(size_differences(tile.model))
             leave_out(tile, 1.0)
+            tile.update_diffuse()
     for number in range(options.max_rounds):
         find(tile, options.faintest, len(_FALLING) + number)
         tile.step(0.05)
@@ -57,6 +58,7 @@ def _find_all(tile):
         else:
             tile.step(0.05)
             tile.reject(leave_out(tile, options.keep))
+        tile.update_diffuse()
 
 
 def _settle(tile):

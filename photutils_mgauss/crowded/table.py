@@ -3,7 +3,7 @@ import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss import kernels
-from photutils_mgauss.crowded.search import extended
+from photutils_mgauss.crowded.judge import smooth_light
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.utils.flags import (
     BLENDED,
@@ -60,12 +60,11 @@ def tabulate(tile, core):
     with np.errstate(invalid='ignore'):
         error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     count, chi2, deviation, centre, crowding, _ = quality.T
-    node, share = model.mesh.shares(s.x, s.y)
     flux = np.maximum(s.flux, 1e-300)
     strength = np.divide(s.flux, error[:, 0], where=error[:, 0] > 0,
                          out=np.zeros(len(s)))
     measured = s.replaced(
-        local_bkg=(model.level[node] * share).sum(axis=1),
+        local_bkg=model.background_at(s.x, s.y),
         x_err=error[:, 1], y_err=error[:, 2], flux_err=error[:, 0],
         xy_cov=covariance[:, 1, 2], n_pixels_fit=count.astype(int),
         qfit=deviation / flux, cfit=centre / flux,
@@ -150,7 +149,7 @@ def _flags(tile, quality, error, correlation):
                                     * error[:, 0])),
             (NO_COVARIANCE, ~np.isfinite(error).all(axis=1)),
             (SATURATED, (quality[:, 5] < 0.5)),
-            (NOT_A_STAR, (extended(tile.model)
+            (NOT_A_STAR, (smooth_light(tile.model)
                           | _unlike_a_star(s.flux, quality))),
             (BLENDED, np.abs(correlation) > _BLEND_CORRELATION)):
         flags[where] |= bit

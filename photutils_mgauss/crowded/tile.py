@@ -172,6 +172,11 @@ class Tile:
         self.model.take_in_place(step, level_step, np.flatnonzero(restless))
         self._form_equations()
 
+    def update_diffuse(self):
+        """Find the diffuse light again."""
+        self.model.update_diffuse()
+        self._form_equations()
+
     # What a search leaves behind.
 
     def reject(self, places):

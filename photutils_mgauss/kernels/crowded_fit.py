@@ -70,9 +70,11 @@ def mesh_sums(weight, residual, background, rows, columns, n_columns, clip,
     """
     Put sums over the pixels of each node of a background into out (m, 3).
 
-    In order: the weight; the weight of pixels within clip standard errors of
-    the model; and that times what of those pixels is no star's. Pixels
-    belong to the nodes of rows (ny,) and columns (nx,).
+    In order: the weight; the weight of pixels not more than clip standard
+    errors above the model; and that times what of those pixels is no star's,
+    where pixels count as not more than clip standard errors below the model:
+    stars are above a sky, nothing is below it. Pixels belong to the nodes of
+    rows (ny,) and columns (nx,).
     """
     for node in range(out.shape[0]):
         out[node, 0] = out[node, 1] = out[node, 2] = 0.0
@@ -85,6 +87,9 @@ def mesh_sums(weight, residual, background, rows, columns, n_columns, clip,
             if w * r * r <= clip * clip:
                 out[node, 1] += w
                 out[node, 2] += w * (r + background[j, i])
+            elif r < 0:
+                out[node, 1] += w
+                out[node, 2] += w * background[j, i] - clip * sqrt(w)
 
 
 @inner

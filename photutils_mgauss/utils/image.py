@@ -507,7 +507,9 @@ def photon_slope(data, variance):
         slope = np.sum(step * change) / power if power > 0 else 0.0
         if slope <= 0:
             continue
-        rest = np.median(np.abs(change - slope * step)) / (slope * noise)
+        rest = change - slope * step
+        # A steep sky that is not in the variance is the same in most steps.
+        rest = np.median(np.abs(rest - np.median(rest))) / (slope * noise)
         if rest < scatter:
             best, scatter = (slope, clipped), rest
     return best
