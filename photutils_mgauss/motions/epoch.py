@@ -269,7 +269,7 @@ def _check_chips(epoch):
         raise ValueError(msg)
     known = np.isin(np.asarray(epoch.table['chip']), list(epoch.chips))
     if not known.all():
-        unknown = np.asarray(epoch.table['chip'])[~known][0]
+        unknown = np.asarray(epoch.table['chip'])[~known][0].item()
         msg = (f"the column 'chip' must hold names of chips, got {unknown!r};"
                f' there are {list(epoch.chips)}')
         raise ValueError(msg)
@@ -355,6 +355,7 @@ class Detections:
     radial_velocity: np.ndarray
     found: np.ndarray
     usable: np.ndarray
+    chip: np.ndarray | None = None
 
 
 def numbers(table, key, unit=None):
@@ -526,7 +527,9 @@ def read_epoch(epoch, plane=None, vectors=None, turn=None):
     found = np.isfinite(positions).all(axis=0) & np.isfinite(years)
     return Detections(ids, np.where(found, positions, np.nan), covariance,
                       years, flux, velocity, found,
-                      found & is_definite_2x2(covariance))
+                      found & is_definite_2x2(covariance),
+                      None if epoch.chips is None
+                      else np.asarray(epoch.table['chip']))
 
 
 def _read_plane(epoch):
