@@ -15,6 +15,7 @@ from photutils_mgauss.motions.priors import (
 )
 from photutils_mgauss.motions.stacked import variance_2x2
 from photutils_mgauss.sky.transforms import Transform
+from photutils_mgauss.utils.validation import as_rng
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +234,7 @@ def _hold_out(stars, options):
     n = round(options.hold_out * len(stars))
     if n == 0:
         return np.empty(0, dtype=int)
-    rng = np.random.default_rng(options.rng)
+    rng = as_rng(options.rng)
     return np.sort(rng.choice(stars, n, replace=False))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 
 from photutils_mgauss.sky.tangent_plane import local_axes, unit_vectors
+from photutils_mgauss.utils.validation import as_integer, as_real
 
 STEP = 0.5  # pixels either side of a star for derivatives of a WCS
 
@@ -127,6 +128,12 @@ def invert_wcs(wcs, coordinates, *, start=None, tolerance=1e-7,
     array([90.   , 89.999])
     """
     check_celestial(wcs)
+    if not isinstance(coordinates, SkyCoord):
+        msg = ('coordinates must be a SkyCoord, got '
+               f'{type(coordinates).__name__}')
+        raise TypeError(msg)
+    tolerance = as_real(tolerance, 'tolerance', above=0)
+    max_iterations = as_integer(max_iterations, 'max_iterations', minimum=1)
     target = np.asarray(coordinates.icrs.cartesian.xyz.value)
     shape = target.shape[1:]
     target = target.reshape(3, -1)
