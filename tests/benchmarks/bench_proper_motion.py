@@ -525,7 +525,8 @@ def bench_matching(n):
          f'{wrong / sum(map(len, numbers)):.1e}')
 
 
-PARTS = ('pulls', 'one_epoch', 'chips', 'transits', 'paper', 'recipes', 'epochs', 'speed', 'whole')
+PARTS = ('pulls', 'one_epoch', 'chips', 'transits', 'paper', 'recipes',
+         'epochs', 'speed', 'whole')
 
 
 def main():
