@@ -1,12 +1,19 @@
 """Epochs whose WCS contain the maps that were found for them."""
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from photutils_mgauss.motions.epoch import numbers
-from photutils_mgauss.sky.corrected_wcs import Region, corrected_wcs
+from photutils_mgauss.motions.chips import rows_of_chips
+from photutils_mgauss.motions.epoch import numbers, pixels
+from photutils_mgauss.sky.corrected_wcs import (
+    Region,
+    corrected_header,
+    corrected_wcs,
+)
 from photutils_mgauss.sky.correction import Correction
 from photutils_mgauss.sky.observers import observer_velocity
+from photutils_mgauss.sky.wcs import pixel_to_vectors
 
 
 def correct_epochs(result):
@@ -21,13 +28,17 @@ def correct_epochs(result):
         return list(sightings.epochs), [np.nan] * len(sightings.epochs)
     # A wild place, which the fit left out, is no part of the image.
     sound = result.state.used & ~result.state.untied
-    pairs = [correct_epoch(
-        epoch, Correction(sightings.plane, transform, coefficients,
-                          _velocity(epoch, turn), turn), tie, rows[inside])
-             for epoch, coefficients, turn, tie, rows, inside in zip(
-                 sightings.epochs, result.state.maps, sightings.turns,
-                 sightings.ties.maps, sightings.matches.rows, sound,
-                 strict=True)]
+    pairs = []
+    for e, epoch in enumerate(sightings.epochs):
+        turn, rows = sightings.turns[e], sightings.matches.rows[e, sound[e]]
+        correction = Correction(sightings.plane, transform,
+                                result.state.maps[e], _velocity(epoch, turn),
+                                turn)
+        if epoch.chips is None:
+            pairs.append(correct_epoch(epoch, correction,
+                                       sightings.ties.maps[e], rows))
+        else:
+            pairs.append(_correct_chips(epoch, correction, result, rows))
     return tuple(list(some) for some in zip(*pairs, strict=True))
 
 
@@ -54,6 +65,31 @@ def correct_epoch(epoch, correction, tie, rows):
     region = Region.of(epoch.wcs, *_stars_pixels(epoch, rows))
     wcs, residual = corrected_wcs(epoch.wcs, correction, region, pixel_map)
     return replace(epoch, wcs=wcs, pixel_scale=None), residual
+
+
+def _correct_chips(epoch, correction, result, rows):
+    """Return an epoch with corrected WCS of its chips, and their residual."""
+    used = np.zeros(len(epoch.table), dtype=bool)
+    used[rows] = True
+    x, y = pixels(epoch)
+    chips, residuals = {}, []
+    for wcs, own, name in rows_of_chips(epoch):
+        seen = own[used[own]]
+        if not len(seen):  # Nothing was seen of it: its frame's map is known.
+            seen = np.zeros(1, dtype=int)
+        region = Region.of(wcs, x[seen], y[seen])
+        chips[name], residual = corrected_header(wcs, partial(
+            _through_chip, wcs, name, correction, result), region)
+        residuals.append(residual)
+    return replace(epoch, chips=chips), max(residuals)
+
+
+def _through_chip(wcs, name, correction, result, x, y):
+    """Return corrected directions (3, n) of pixels of a chip."""
+    distortion = result.setup.distortion
+    if distortion is not None:
+        x, y = distortion.pixels(result.state.distortion, name, x, y)
+    return correction(pixel_to_vectors(wcs, x, y, bounded=False))
 
 
 def _stars_pixels(epoch, rows):

@@ -11,6 +11,11 @@ import numpy as np
 from astropy.coordinates import CartesianRepresentation
 from astropy.table import Table
 
+from photutils_mgauss.motions.chips import (
+    chip_jacobian,
+    chip_vectors,
+    joined_chips,
+)
 from photutils_mgauss.motions.stacked import is_definite_2x2, sandwich_2x2
 from photutils_mgauss.sky.observers import (
     _known_observer,
@@ -90,6 +95,9 @@ class Epoch:
         are positions corrected for aberration; see `barycentric_observer`.
     pixel_scale : `~astropy.units.Quantity`, optional
         Angle of one pixel, for epochs without WCS.
+    chips : dict, optional
+        In place of ``wcs`` the WCS of each chip of a camera, by the names
+        in a column ``chip``; see `Epoch.of_chips`.
 
     Raises
     ------
@@ -112,6 +120,54 @@ class Epoch:
     time: object = None
     observer: object = field(default=None, kw_only=True)
     pixel_scale: u.Quantity = field(default=None, kw_only=True)
+    chips: dict = field(default=None, kw_only=True)
+
+    @classmethod
+    def of_chips(cls, pairs, time=None, *, observer=None, names=None):
+        """
+        Return one exposure of a camera with several chips.
+
+        It has one map onto the other epochs, whatever their number, and
+        chips of the same name have the same distortion in all exposures.
+
+        Parameters
+        ----------
+        pairs : sequence of (`~astropy.table.Table`, WCS)
+            The stars of each chip, in pixels, and its WCS.
+        time, observer : optional
+            As for an epoch.
+        names : sequence, optional
+            What the chips are called; the default is their numbers from 0.
+            Different cameras need different names.
+
+        Returns
+        -------
+        Epoch
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a table lacks a column, a WCS is not celestial, or two chips
+            have one name.
+
+        Examples
+        --------
+        >>> from astropy.table import Table
+        >>> from astropy.wcs import WCS
+        >>> from photutils_mgauss import Epoch
+        >>> pairs = []
+        >>> for k in range(2):
+        ...     table = Table({'x_fit': [10.0], 'y_fit': [20.0],
+        ...                    'x_err': [0.01], 'y_err': [0.01]})
+        ...     wcs = WCS({'CTYPE1': 'RA---TAN', 'CTYPE2': 'DEC--TAN',
+        ...                'CDELT1': -1e-5, 'CDELT2': 1e-5,
+        ...                'CRPIX1': -2048 * k})
+        ...     pairs.append((table, wcs))
+        >>> Epoch.of_chips(pairs, time=2026.5)
+        <Epoch: 2 stars at 2026.500, 2 chips>
+        """
+        table, chips = joined_chips(pairs, names)
+        return cls(table, time=time, observer=observer, chips=chips)
 
     def __post_init__(self):
         if not isinstance(self.table, Table):
@@ -120,6 +176,7 @@ class Epoch:
             raise TypeError(msg)
         if self.wcs is not None:
             check_celestial(self.wcs)
+        _check_chips(self)
         _check_observer(self.observer)
         _check_columns(self.table, self.is_pixels, self.is_scan)
         _check_scale(self)
@@ -130,6 +187,8 @@ class Epoch:
         stars = f'{n} star' if n == 1 else f'{n} stars'
         package = type(self.wcs).__module__.split('.')[0]
         wcs = 'no WCS' if self.wcs is None else f'{package} WCS'
+        if self.chips is not None:
+            wcs = f'{len(self.chips)} chips'
         return f'<Epoch: {stars} at {self.mean_year:.3f}, {wcs}>'
 
     @property
@@ -137,7 +196,11 @@ class Epoch:
         """Whether positions are x, y, which win over ra, dec."""
         has_xy = find_column(self.table, names_of('x')) is not None
         has_sky = 'ra' in self.table.colnames
-        return has_xy and (self.wcs is not None or not has_sky)
+        return has_xy and (self._has_wcs or not has_sky)
+
+    @property
+    def _has_wcs(self):
+        return self.wcs is not None or self.chips is not None
 
     @property
     def is_scan(self):
@@ -147,7 +210,7 @@ class Epoch:
     @property
     def is_sky(self):
         """Whether the epoch has places in the sky, by WCS or ra, dec."""
-        return self.wcs is not None or not self.is_pixels
+        return self._has_wcs or not self.is_pixels
 
     @property
     def plane_unit(self):
@@ -193,6 +256,23 @@ class Epoch:
         Epoch
         """
         return replace(self, wcs=wcs)
+
+
+def _check_chips(epoch):
+    if epoch.chips is None:
+        return
+    if epoch.wcs is not None:
+        msg = 'wcs must be None for an epoch of chips, which have their own'
+        raise ValueError(msg)
+    if 'chip' not in epoch.table.colnames:
+        msg = (f"table must have a column 'chip', got {epoch.table.colnames}")
+        raise ValueError(msg)
+    known = np.isin(np.asarray(epoch.table['chip']), list(epoch.chips))
+    if not known.all():
+        unknown = np.asarray(epoch.table['chip'])[~known][0].item()
+        msg = (f"the column 'chip' must hold names of chips, got {unknown!r};"
+               f' there are {list(epoch.chips)}')
+        raise ValueError(msg)
 
 
 def _check_observer(observer):
@@ -275,6 +355,7 @@ class Detections:
     radial_velocity: np.ndarray
     found: np.ndarray
     usable: np.ndarray
+    chip: np.ndarray | None = None
 
 
 def numbers(table, key, unit=None):
@@ -291,7 +372,8 @@ def sky_vectors(epoch):
     """Return ICRS unit vectors (3, n) of an epoch with sky positions."""
     if epoch.is_pixels:
         x, y = pixels(epoch)
-        vectors = pixel_to_vectors(epoch.wcs, x, y)
+        vectors = (pixel_to_vectors(epoch.wcs, x, y) if epoch.chips is None
+                   else chip_vectors(epoch, x, y))
     else:
         vectors = table_vectors(epoch.table)
     if epoch.is_scan:
@@ -445,7 +527,9 @@ def read_epoch(epoch, plane=None, vectors=None, turn=None):
     found = np.isfinite(positions).all(axis=0) & np.isfinite(years)
     return Detections(ids, np.where(found, positions, np.nan), covariance,
                       years, flux, velocity, found,
-                      found & is_definite_2x2(covariance))
+                      found & is_definite_2x2(covariance),
+                      None if epoch.chips is None
+                      else np.asarray(epoch.table['chip']))
 
 
 def _read_plane(epoch):
@@ -477,7 +561,9 @@ def _sky_covariance(epoch, plane, positions, turn):
         covariance = _covariance(epoch.table, *errors, unit=unit**2)
     if epoch.is_pixels:
         x, y = pixels(epoch)
-        jacobian = pixel_jacobian(epoch.wcs, plane, x, y, turn)
+        jacobian = (pixel_jacobian(epoch.wcs, plane, x, y, turn)
+                    if epoch.chips is None
+                    else chip_jacobian(epoch, plane, x, y, turn))
     elif turn is None:
         jacobian = plane.local_jacobian(positions)
     else:  # The errors are along east and north as the table has them.

@@ -83,6 +83,11 @@ class ProperMotionFitter:
         the references' mean residual.
     rng : `~numpy.random.Generator` or int, optional
         For choosing the references held out.
+    distortion : str or None, optional
+        What the chips of `Epoch.of_chips` may differ by from their WCS, the
+        same in all exposures: 'affine', 'poly-n', or None for nothing.
+    distortion_prior : `~astropy.units.Quantity`, optional
+        How large each term of it may be at the edge of a chip.
 
     Examples
     --------
@@ -111,7 +116,8 @@ class ProperMotionFitter:
                  systematic='fit', executor=None, match_by='auto',
                  match_radius=None, max_motion=50 * u.mas / u.yr, clip=5.0,
                  hold_out=0.0, parallax_prior=(0.5, 0.5) * u.mas,
-                 acceleration=False, eps_t='printed', rng=None):
+                 acceleration=False, eps_t='printed', rng=None,
+                 distortion='affine', distortion_prior=2 * u.arcsec):
         self.transform = transform
         self.parallax = parallax
         self.recipe = recipe
@@ -128,6 +134,8 @@ class ProperMotionFitter:
         self.acceleration = acceleration
         self.eps_t = eps_t
         self.rng = rng
+        self.distortion = distortion
+        self.distortion_prior = distortion_prior
         self._options()
         self._how_to_match()
 
@@ -196,7 +204,9 @@ class ProperMotionFitter:
         return Options(Transform.parse(self.transform), self.recipe,
                        self.parallax, tuple(prior), bool(self.acceleration),
                        _systematic(self.systematic), clip, self.max_motion,
-                       held, self.eps_t, self.rng, self.executor)
+                       held, self.eps_t, self.rng, self.executor,
+                       _distortion(self.distortion), _check_quantity(
+                           self.distortion_prior, 'distortion_prior', u.mas))
 
 
 def _check_quantity(value, name, *units):
@@ -209,6 +219,15 @@ def _check_quantity(value, name, *units):
         msg = f'{name} must be finite and not negative, got {value}'
         raise ValueError(msg)
     return value
+
+
+def _distortion(value):
+    kind = Transform.parse(value)
+    if kind.kind not in ('none', 'affine', 'polynomial'):
+        msg = ("distortion must be 'affine', 'poly-n' with a degree n > 0, "
+               f'or None, got {value!r}')
+        raise ValueError(msg)
+    return kind
 
 
 def _systematic(value):

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri, ndtr
 
+from photutils_mgauss.motions.chip_maps import reduce_chips, without_chips
 from photutils_mgauss.motions.frames import (
     Frames,
     fixed_frames,
@@ -89,8 +90,9 @@ def pose(setup, state):
         setup.places.of(state.dropped))
     offsets = np.empty_like(sightings.places)
     weights = np.empty_like(sightings.covariance)
+    places = setup.undistorted(state)
     for e, coefficients in enumerate(state.maps):
-        aligned = transform.apply(coefficients, sightings.places[:, e])
+        aligned = transform.apply(coefficients, places[:, e])
         offsets[:, e] = aligned - setup.origin
         covariance = measured(setup, state, e)
         weights[:, e] = np.where(state.used[e], invert_2x2(*covariance), 0.0)
@@ -128,9 +130,11 @@ def _step(setup, state):
     problem = pose(setup, state)
     if setup.transform.n_parameters == 0:
         frames = fixed_frames(problem)
-    else:
+    elif setup.distortion is None:
         reduced = reduce_all(problem, setup.options.executor)
         frames = solve_frames(problem, reduced, relative=setup.relative)
+    else:
+        frames, state = _solve_chips(setup, state, problem)
     maps = np.stack([setup.transform.project(one)
                      for one in state.maps + frames.correction])
     swerve = state.swerve
@@ -138,6 +142,16 @@ def _step(setup, state):
         found = solve(setup, problem.select(setup.nearing.stars), frames)
         swerve = swerved(setup, swerve, found.values)
     return problem, frames, replace(state, maps=maps, swerve=swerve)
+
+
+def _solve_chips(setup, state, problem):
+    """Return the frames, and the state with new polynomials of chips."""
+    chips = reduce_chips(problem, setup.distortion, state.distortion)
+    reduced, back = without_chips(
+        reduce_all(problem, setup.options.executor), chips)
+    frames = solve_frames(problem, reduced, relative=setup.relative)
+    change = back(frames.correction).reshape(state.distortion.shape)
+    return frames, replace(state, distortion=state.distortion + change)
 
 
 def _align(setup, state):

@@ -244,7 +244,8 @@ def _match_turned(detections, known, tolerance, maps):
     if reach and tolerance.radius is None and tolerance.max_motion == 0:
         # Pixels, whose motions nobody knows a limit of.
         tolerance = replace(tolerance, radius=reach)
-    return match_positions(places, sigmas, years, tolerance, known)
+    return match_positions(places, sigmas, years, tolerance, known,
+                           [one.chip for one in detections])
 
 
 def _named(matches, detections, catalogue, known):

@@ -11,11 +11,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from photutils_mgauss.sky.transforms import monomials
 from photutils_mgauss.utils.robust import std_about_zero
 
 # Field stars that tie one exposure to the next one before it is matched.
 SAMPLE = 20000
 N_SIGMA = 5.0
+# Of the polynomials that bend a chip onto known stars, one after another.
+DEGREES = (1, 1, 2, 3, 3, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +142,8 @@ class Tolerance:
         return error + motion + slack
 
 
-def match_positions(places, sigmas, years, tolerance, catalogue=None):
+def match_positions(places, sigmas, years, tolerance, catalogue=None,
+                    chips=None):
     """
     Match exposures by position.
 
@@ -154,6 +158,9 @@ def match_positions(places, sigmas, years, tolerance, catalogue=None):
     tolerance : `Tolerance`
     catalogue : `Known` or sequence, optional
         Stars whose motions are known.
+    chips : list of (n_e,) `~numpy.ndarray` or None, optional
+        The chips that rows are on, where an exposure has several, each of
+        which may be distorted.
 
     Returns
     -------
@@ -164,7 +171,8 @@ def match_positions(places, sigmas, years, tolerance, catalogue=None):
     rows = [None] * len(places)
     for e in np.argsort(years, kind='stable'):
         sigma = np.nan_to_num(sigmas[e], nan=0.0, posinf=0.0)
-        rows[e] = _match_one(master, places[e], sigma, years[e], tolerance)
+        rows[e] = _match_one(master, places[e], sigma, years[e], tolerance,
+                             None if chips is None else chips[e])
     table = np.full((len(places), len(master.year)), -1)
     for e, stars in enumerate(rows):
         table[e, stars] = np.arange(len(stars))
@@ -183,7 +191,7 @@ def _start(catalogue):
                    np.zeros(n, dtype=bool))
 
 
-def _match_one(master, places, sigma, year, tolerance):
+def _match_one(master, places, sigma, year, tolerance, chip):
     """Return the star of each row, adding the rows that are new stars."""
     stars = np.full(places.shape[1], -1)
     finite = np.flatnonzero(np.isfinite(places).all(axis=0))
@@ -191,7 +199,11 @@ def _match_one(master, places, sigma, year, tolerance):
     if usable.any() and len(finite):
         known = np.flatnonzero(usable)
         tree = cKDTree(master.at(year)[:, known].T)
-        moved, slack = _tie(tree, places[:, finite], tolerance)
+        if chip is None:
+            moved, slack = _tie(tree, places[:, finite], tolerance)
+        else:
+            moved, slack = _tie_chips(tree, places[:, finite], tolerance,
+                                      chip[finite])
         stars[finite] = _pair(master, tree, known, moved, sigma[finite],
                               year, tolerance, slack)
         places = places.copy()
@@ -273,6 +285,48 @@ def _tie(tree, places, tolerance):
     matrix, rms = _affine_tie(tree, sample + shift[:, None], reach)
     moved = matrix[:, :1] + matrix[:, 1:] @ moved
     return moved, 3 * rms
+
+
+def _tie_chips(tree, places, tolerance, chip):
+    """
+    Move the chips of an exposure onto the known stars, each for itself.
+
+    Returns the same as `_tie`.
+    """
+    moved, slack = places.copy(), 0.0
+    reach = max(tolerance.pointing, 2 * (tolerance.radius or 0.0))
+    for name in np.unique(chip):
+        own = np.flatnonzero(chip == name)
+        shift = _vote(tree, places[:, own], reach)
+        moved[:, own], rms = _bent(tree, places[:, own] + shift[:, None],
+                                   reach / 2)
+        slack = max(slack, 3 * rms)
+    return moved, slack
+
+
+def _bent(tree, places, reach):
+    """
+    Return places bent onto their nearest neighbours, and the scatter left.
+
+    By polynomials whose degree rises as far as there are stars enough.
+    """
+    middle = places.mean(axis=1, keepdims=True)
+    scaled = (places - middle) / max(np.ptp(places), 1e-300)
+    moved, rms = places, 0.0
+    for degree in DEGREES:
+        basis = monomials(scaled, degree)
+        distance, near = tree.query(moved.T,
+                                    distance_upper_bound=max(reach, 1e-300))
+        good = np.isfinite(distance)
+        if good.sum() < 4 * len(basis):
+            break
+        target = tree.data[near[good]].T
+        fit = np.linalg.lstsq(basis[:, good].T, target.T, rcond=None)[0].T
+        moved = fit @ basis
+        residual = target - moved[:, good]
+        rms = std_about_zero(np.hypot(*residual)) / np.sqrt(2)
+        reach = min(reach, max(6 * rms, reach / 2))
+    return moved, rms
 
 
 def _sample(n):

@@ -5,6 +5,8 @@ import astropy.units as u
 import numpy as np
 
 from photutils_mgauss.motions.assemble import Sightings
+from photutils_mgauss.motions.chips import Distortion, distortion_of
+from photutils_mgauss.motions.epoch import pixels
 from photutils_mgauss.motions.perspective import Nearing
 from photutils_mgauss.motions.priors import (
     Priors,
@@ -32,6 +34,8 @@ class Options:
     eps_t: str
     rng: object
     executor: object
+    distortion: Transform
+    distortion_prior: u.Quantity
 
     @property
     def n_star_parameters(self):
@@ -81,6 +85,8 @@ class Setup:
         What could not be used, in sentences.
     typical_variance : float
         Median variance of the detections, 1 if there are none.
+    distortion : `~photutils_mgauss.motions.chips.Distortion` or None
+        Of the chips of cameras, if there are any.
     """
 
     sightings: Sightings
@@ -98,6 +104,14 @@ class Setup:
     nearing: Nearing
     notes: tuple
     typical_variance: float
+    distortion: Distortion | None
+
+    def undistorted(self, state):
+        """Return the places (2, E, n) with the distortion of chips gone."""
+        if self.distortion is None:
+            return self.sightings.places
+        return (self.sightings.places
+                + self.distortion.shift(state.distortion))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +125,7 @@ class State:
     ``swerve`` (2, E, k) what stars of known radial velocity move beyond the
     model, ``crooked`` (n,) stars that no straight motion explains, whose
     detections are all kept, ``unfinished`` whether there may be outliers
-    left.
+    left, ``distortion`` (C, 2, b) the polynomials of chips [pix], if any.
     """
 
     maps: np.ndarray
@@ -122,6 +136,7 @@ class State:
     swerve: np.ndarray
     crooked: np.ndarray
     unfinished: bool = False
+    distortion: np.ndarray | None = None
 
 
 def prepare(sightings, options):
@@ -150,13 +165,16 @@ def prepare(sightings, options):
                                     options.parallax_prior)
     variance = variance_2x2(sightings.covariance[:, sightings.usable])
     maps = np.repeat(transform.identity()[None], len(dt), axis=0)
+    distortion = distortion_of(sightings, pixels, options.distortion,
+                               options.distortion_prior.to_value(u.mas))
     return (Setup(sightings, options, transform, origin, working, dt, priors,
                   places, anchors, held, relative, drift, nearing, notes,
-                  np.median(variance) if variance.size else 1.0),
+                  np.median(variance) if variance.size else 1.0, distortion),
             State(maps, sightings.usable.copy(), floor,
                   np.empty(0, dtype=int), untied,
                   np.zeros((2, len(dt), len(nearing.stars))),
-                  np.zeros(len(anchors), dtype=bool)))
+                  np.zeros(len(anchors), dtype=bool),
+                  distortion=distortion and distortion.none()))
 
 
 def _check_options(options, sightings):

@@ -40,6 +40,11 @@ def decode_motion_flags(flags):
     -------
     list of str
 
+    Raises
+    ------
+    TypeError, ValueError
+        If ``flags`` is no integer, or negative.
+
     Examples
     --------
     >>> from photutils_mgauss import decode_motion_flags

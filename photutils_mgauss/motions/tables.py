@@ -340,7 +340,8 @@ def residual_table(fit):
 
 def _add_aligned(table, fit, at, unit):
     setup, sightings = fit.setup, fit.setup.sightings
-    aligned = np.stack([setup.transform.apply(one, sightings.places[:, e])
+    places = setup.undistorted(fit.state)
+    aligned = np.stack([setup.transform.apply(one, places[:, e])
                         for e, one in enumerate(fit.state.maps)], axis=1)
     if sightings.plane is not None:
         ra, dec = directions(sightings.plane.deproject(aligned))

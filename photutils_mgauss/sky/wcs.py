@@ -114,6 +114,11 @@ def invert_wcs(wcs, coordinates, *, start=None, tolerance=1e-7,
         Pixel positions, 0 at the centre of the first pixel; NaN where the
         iteration did not converge.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If the WCS is not celestial, or a number is out of range.
+
     Examples
     --------
     >>> from astropy.coordinates import SkyCoord

@@ -22,6 +22,7 @@ from scipy.optimize import curve_fit
 from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+from helpers.camera import expose, known_stars, make_field
 from helpers.motion_scenes import (
     SUBSETS,
     TIMES,
@@ -29,7 +30,7 @@ from helpers.motion_scenes import (
     observe,
     pulls,
 )
-from helpers.one_epoch import gaia_table, make_sky, observe_once
+from helpers.one_epoch import PIXEL, gaia_table, make_sky, observe_once
 from helpers.one_epoch import pulls as one_epoch_pulls
 from photutils_mgauss import Epoch, ProperMotionFitter
 from photutils_mgauss.motions.frames import solve_frames
@@ -180,6 +181,49 @@ def compare_with_two(gaia, epoch, sky):
     error = one['pmra_error'].value
     return (error / two['pmra_error'].value,
             np.abs(one['pmra'].value - two['pmra'].value) / error)
+
+
+# Cameras of many chips, scans of one star
+
+def bench_chips():
+    heading('Six exposures of 18 chips: unknown distortions of an arcsecond')
+    errors = {}
+    for size, distortion in ((0.0, None), (1e3 / PIXEL, 'poly-3')):
+        rng = np.random.default_rng(1)
+        field = make_field(rng, columns=6, rows=3, per_chip=100, size=size)
+        epochs = [expose(field, rng, year) for year in
+                  (2010, 2011.5, 2013, 2015, 2018, 2020)]
+        fitter = ProperMotionFitter(references=known_stars(field, rng, 300),
+                                    distortion=distortion, match_by='id')
+        seconds, solution = cpu(lambda f=fitter, e=epochs: f.fit(e))
+        stars = solution.stars
+        use = (stars['n_good_obs'] == 6) & (stars['id'] >= 300)
+        errors[size] = rms(stars['pmra'].value[use]
+                           - field.pm[0, stars['id'][use]])
+        line(f'  distortions of {size:.0f} pixels, {distortion}', '',
+             f'rms {errors[size]:.4f} mas/yr, {seconds:.1f} s')
+    flat, bent = errors.values()
+    line('  over the error without distortions', '<= 1.03',
+         f'{bent / flat:.3f}')
+
+
+def bench_transits(n=599):
+    heading(f'{n} transits of one star, in one direction each')
+    for what, size in (('a star', 0.0), ('a binary', 25.0)):
+        rng = np.random.default_rng(1)
+        years = 2014.5 + np.sort(rng.uniform(0, 5, n))
+        angle = rng.uniform(0, 2 * np.pi, n)
+        along = (size * np.cos(2 * np.pi * years / 11.6) * np.sin(angle)
+                 + rng.normal(0, 0.2, n))
+        epochs = [Epoch(Table({'id': [1], 'ra': [294.8], 'dec': [14.9],
+                               'along': [w], 'along_error': [0.2],
+                               'scan_angle': [np.degrees(a)]}), time=year)
+                  for w, a, year in zip(along, angle, years, strict=True)]
+        fitter = ProperMotionFitter(transform=None, parallax=True,
+                                    match_by='id')
+        fitter.fit(epochs)
+        seconds, _ = cpu(lambda f=fitter, e=epochs: f.fit(e))
+        line(f'  {what}, rejection included [s]', '< 3', f'{seconds:.1f}')
 
 
 # The paper
@@ -481,7 +525,8 @@ def bench_matching(n):
          f'{wrong / sum(map(len, numbers)):.1e}')
 
 
-PARTS = ('pulls', 'one_epoch', 'paper', 'recipes', 'epochs', 'speed', 'whole')
+PARTS = ('pulls', 'one_epoch', 'chips', 'transits', 'paper', 'recipes',
+         'epochs', 'speed', 'whole')
 
 
 def main():
@@ -498,6 +543,10 @@ def main():
         bench_field_mean()
     if 'one_epoch' in parts:
         bench_one_epoch()
+    if 'chips' in parts:
+        bench_chips()
+    if 'transits' in parts:
+        bench_transits()
     if 'paper' in parts:
         bench_fig11()
     if 'recipes' in parts:
