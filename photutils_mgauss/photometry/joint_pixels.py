@@ -188,7 +188,9 @@ class State:
     (g, C, m, m) the inverse of their own matrix and ``cross`` (g, C, m p, m)
     what joins both. ``curves`` (g, E, m, 2, m, 2) are the products of the
     derivatives in each image, for a flux of 1, ``slopes`` (g, E, m, 2) the
-    gradients there.
+    gradients there, ``weights`` (g, E, m) the inverse variances of fluxes
+    that the image alone has of the star alone, ``excess`` (g, E, m) the
+    products of the PSF with what is left of the data.
     """
 
     values: np.ndarray
@@ -201,6 +203,8 @@ class State:
     cross: np.ndarray
     curves: np.ndarray
     slopes: np.ndarray
+    weights: np.ndarray
+    excess: np.ndarray
     n_pixels: np.ndarray
     sky: np.ndarray
 
@@ -326,7 +330,11 @@ def _state(joint, values, slopes, moments):
     matrix -= np.einsum('gcpi,gcij,gcqj->gpq', cross, known, cross,
                         optimize=True)
     return State(values, chi2, moments.squares.sum(axis=1), matrix, gradient.reshape(n, m * p), fluxes,
-                 known, cross, curves, pulls, moments.n_pixels,
+                 known, cross, curves, pulls,
+                 np.einsum('geii->gei', moments.products[..., ::3, ::3]),
+                 moments.data[..., ::3] - np.einsum(
+                     'geij,gej->gei', moments.products[..., ::3, ::3], flux),
+                 moments.n_pixels,
                  moments.levels(flux))
 
 
