@@ -20,8 +20,11 @@ eliminated. Groups of m neighbours are fitted together: v is that of all.
 Arrays have the g groups first: (g, m, p) parameters, (g, E, m) of E images.
 """
 from dataclasses import dataclass, fields
+from functools import cache
 
 import numpy as np
+from scipy.special import ndtri
+from scipy.stats import qmc
 
 from photutils_mgauss import kernels
 from photutils_mgauss.photometry.engine import cut_boxes
@@ -37,6 +40,11 @@ _ROUNDING = 1e-14
 
 # Where no longer step lowers chi2 either, a small one is the last.
 _HOPELESS = 1e8
+
+# How many points a likelihood is sampled at, and how much wider they lie than
+# the Gaussian of its peak.
+_SAMPLES = 128
+_WIDE = 1.5
 
 # The least eigenvalue of a matrix of unit diagonal that says enough.
 _SINGULAR = 1e-11
@@ -255,7 +263,7 @@ class JointFit:
     def minimize(self):
         """Return the `State` at the least chi2, and who converged (g,)."""
         n = len(self.free)
-        state = self.evaluate(self.views.values, np.arange(n))
+        state = self.evaluate(self.views.values.copy(), np.arange(n))
         damping, done = np.zeros(n), np.zeros(n, bool)
         for _ in range(_MAX_STEPS):
             rows = np.flatnonzero(~done)
@@ -286,6 +294,46 @@ class JointFit:
         # No star moves farther than a pixel at a time.
         step *= np.minimum(1, 1 / np.maximum(length, 1e-300))[:, None]
         return step, (length < TOLERANCE) | (promised < _SMALL)
+
+    def spread(self, state, faint):
+        r"""
+        Return the mean squares (g, p, p) of the likelihood about its peak.
+
+        Where the signal is low the likelihood is not a Gaussian. It is
+        sampled at points :math:`v + L z` of a wider Gaussian, weighted by
+        what it is there; NaN where ``faint`` (g,) does not ask for it. Only
+        for single stars.
+        """
+        n, _, p = state.values.shape
+        out = np.full((n, p, p), np.nan)
+        rows = np.flatnonzero(faint)
+        if not rows.size:
+            return out
+        now = state.take(rows)
+        inverses, _ = fixed_inverse(now.matrix, self.free[rows, 0])
+        values, vectors = np.linalg.eigh(inverses)
+        root = vectors * np.sqrt(np.maximum(values, 0))[:, None, :]
+        points = _points(p)
+        steps = _WIDE * np.einsum('nij,sj->sni', root, points)
+        weight = np.stack([self._likelihood(now, step, rows)
+                           for step in steps])
+        weight += 0.5 * np.sum(points**2, axis=1)[:, None]
+        weight = np.exp(weight - weight.max(axis=0))
+        out[rows] = np.einsum('sn,sni,snj->nij', weight / weight.sum(axis=0),
+                              steps, steps, optimize=True)
+        return out
+
+    def _likelihood(self, state, step, rows):
+        """Return the logarithm of the likelihood a step from the peak."""
+        there = self.evaluate(state.values + step[:, None], rows)
+        return (state.chi2 - there.chi2) / 2
+
+
+@cache
+def _points(size):
+    """Return evenly spread points (s, size) of a Gaussian."""
+    uniform = qmc.Sobol(size, rng=np.random.default_rng(1)).random(_SAMPLES)
+    return ndtri(uniform)
 
 
 def boxes_around(pixels, fit_shape, shapes):
@@ -329,8 +377,9 @@ def _state(joint, values, slopes, moments):
         cross[:, joint.shared[k]] += each[:, k]
     matrix -= np.einsum('gcpi,gcij,gcqj->gpq', cross, known, cross,
                         optimize=True)
-    return State(values, chi2, moments.squares.sum(axis=1), matrix, gradient.reshape(n, m * p), fluxes,
-                 known, cross, curves, pulls,
+    return State(values, chi2, moments.squares.sum(axis=1), matrix,
+                 gradient.reshape(n, m * p), fluxes, known, cross, curves,
+                 pulls,
                  np.einsum('geii->gei', moments.products[..., ::3, ::3]),
                  moments.data[..., ::3] - np.einsum(
                      'geij,gej->gei', moments.products[..., ::3, ::3], flux),
@@ -417,7 +466,7 @@ def covariances(state, free=None):
 
 def fixed_inverse(matrices, free):
     """
-    Return inverses (g, s, s) over what is free, 0 elsewhere; and what is known.
+    Return inverses (g, s, s), 0 for what is not free, and what is known.
 
     What is free of a matrix that is singular is not known.
     """

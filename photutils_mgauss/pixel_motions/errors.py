@@ -7,11 +7,12 @@ matrix S of the fit has :math:`\hat f^2` where the slope of the likelihood has
 
 .. math:: \mathrm{Cov}(v) = A^{-1} S A^{-1},
 
-which is :math:`S^{-1}` for bright stars. Maximizing over places also makes
-fluxes too large, by half the trace of what places were fitted to each,
+which is :math:`S^{-1}` for bright stars. For the faintest the likelihood is
+not even a Gaussian, and its sampled mean squares stand for these. The search
+for the place makes fluxes too large, too, by
 
 .. math:: \frac{\Delta f}{f} = \frac{1}{2 D} \sum_k \mathrm{tr}
-    (G_k J_k\,\mathrm{Cov}(v)\,J_k^T).
+    (G_k J_k S^{-1} J_k^T).
 """
 from dataclasses import dataclass
 
@@ -60,11 +61,13 @@ def errors_of(campaign, solved):
         for c in range(group.shape[1]):
             rows, own = group[:, c], slice(c * p, c * p + p)
             unknown = ~known[:, own, None] | ~known[:, None, own]
-            covariance[rows] = np.where(unknown, np.nan,
-                                        whole[:, own, own])
+            sampled = np.isfinite(solved.spread[rows])
+            covariance[rows] = np.where(unknown, np.nan, np.where(
+                sampled, solved.spread[rows], whole[:, own, own]))
             plain[rows] = inverses[:, own, own]
             variance[rows] = spread[:, campaign.joint.shared, c]
-            bias[rows] = _bias(campaign, solved, rows, whole[:, own, own])
+            bias[rows] = _bias(campaign, solved, rows,
+                               inverses[:, own, own])
     variance = np.where(solved.weights > 0, variance, np.nan)
     return Errors(np.moveaxis(covariance, 0, -1), np.sqrt(variance), bias,
                   plain)

@@ -5,10 +5,15 @@ Lang, Hogg, Jester and Rix (2009, AJ 137, 4400) showed that a model of one
 moving star for all images reaches the bound of the whole data.
 """
 import warnings
+from copy import copy
 from dataclasses import replace
+from functools import partial
 
+import astropy.units as u
 import numpy as np
+from astropy.table import vstack
 from astropy.utils.exceptions import AstropyUserWarning
+from scipy.spatial import cKDTree
 
 from photutils_mgauss.motions import MotionSolution
 from photutils_mgauss.pixel_motions.campaign import read_campaign
@@ -16,17 +21,22 @@ from photutils_mgauss.pixel_motions.errors import (
     errors_of,
     frame_covariance,
 )
+from photutils_mgauss.pixel_motions.find import BRIGHT, Grid, candidates
 from photutils_mgauss.pixel_motions.solution import PixelMotionSolution
-from photutils_mgauss.pixel_motions.solve import solve
+from photutils_mgauss.pixel_motions.solve import fwhm, solve
 from photutils_mgauss.pixel_motions.stars import read_stars
 from photutils_mgauss.pixel_motions.tables import (
+    BAD_POSITION,
+    NOT_CONVERGED,
+    WANDERED,
     chi2_of,
     image_table,
     shift_notes,
     star_table,
 )
-from photutils_mgauss.utils.validation import as_choice, as_shape
+from photutils_mgauss.utils.validation import as_choice, as_real, as_shape
 
+UNSURE = NOT_CONVERGED | WANDERED | BAD_POSITION
 FLUXES = ('image', 'band', 'common')
 NOBODY = ('No image shows any of the stars: the images lie elsewhere on the '
           'sky, or the WCS is not theirs.')
@@ -139,6 +149,62 @@ class PixelMotionFitter:
             warnings.warn(sentence, AstropyUserWarning, stacklevel=2)
         return solution
 
+    def find(self, images, stars=None, *, max_motion=None,
+             false_alarm=1e-5):
+        """
+        Look for stars in the evidence of all images together.
+
+        Parameters
+        ----------
+        images : sequence of `ImageEpoch`
+            As for `fit`; they lie on each other, to within their sizes.
+        stars : `~astropy.table.Table` or SkyCoord, optional
+            Stars that are known, to be fitted and subtracted first. They are
+            not in the result.
+        max_motion : `~astropy.units.Quantity`, optional
+            The largest motion along each axis that is searched; by default
+            that of 0.1 pixels an epoch. Time grows with its square.
+        false_alarm : float, optional
+            How often noise may be taken for a star, at each independent
+            place.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            ``id``, ``ra``, ``dec``, ``pmra``, ``pmdec``, the other columns
+            of a fit of the stars, and ``evidence``, the signal-to-noise
+            ratio of the search; what `fit` takes as ``stars``.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not valid, or images do not lie on each other.
+        """
+        self._check()
+        as_real(false_alarm, 'false_alarm', above=0, maximum=0.5)
+        if max_motion is not None:
+            max_motion = _as_motion(max_motion)
+        campaign = self._read(images, stars)
+        look = partial(candidates, campaign, max_motion,
+                       executor=self.executor)
+        known = ([] if stars is None else
+                 [self._solve(campaign, read_stars(stars, campaign))])
+        bright = look(_light(campaign, known), threshold=BRIGHT)
+        found = [self._found(campaign, bright)]
+        faint = look(_light(campaign, known + found),
+                     false_alarm=false_alarm)
+        every = vstack([bright, _apart(campaign, faint, bright)])
+        table = self._found(campaign, every).stars
+        table['evidence'] = every['evidence']
+        # What does not stay where it was found is no star.
+        return table[(table['flags'] & UNSURE) == 0]
+
+    def _found(self, campaign, table):
+        """Return the solution of stars found."""
+        fitter = copy(self)
+        fitter.references, fitter.forced = None, False
+        return fitter._solve(campaign, read_stars(table, campaign))
+
     def _read(self, images, stars):
         # Parallaxes of places that are given are part of them.
         given = self.forced and 'parallax' in getattr(stars, 'colnames', ())
@@ -191,6 +257,43 @@ class PixelMotionFitter:
             msg = ('executor must be a concurrent.futures.Executor, got '
                    f'{self.executor!r:.80}')
             raise TypeError(msg)
+
+
+def _light(campaign, solutions):
+    """Return x, y and flux (3, n) of solved stars in each image."""
+    out = []
+    for k in range(campaign.n_images):
+        parts = [np.zeros((3, 0))]
+        for one in solutions:
+            solved = one._solved
+            seen = solved.weights[:, k] > 0
+            parts.append(np.stack([*solved.pixels[seen, k].T,
+                                   solved.fluxes[seen, k]]))
+        out.append(np.concatenate(parts, axis=1))
+    return out
+
+
+def _apart(campaign, faint, bright):
+    """Return the faint candidates that are not what bright ones left over."""
+    if not (len(faint) and len(bright)):
+        return faint
+    places = [read_stars(one, campaign).values[:, :2]
+              for one in (faint, bright)]
+    pixel = np.sqrt(abs(np.linalg.det(Grid.of(campaign).matrix)))
+    radius = min(map(fwhm, campaign.epochs)) * pixel
+    away, _ = cKDTree(places[1]).query(places[0])
+    return faint[away > 0.7 * radius]
+
+
+def _as_motion(value):
+    """Return a motion in mas / yr, or raise."""
+    try:
+        value = u.Quantity(value, u.mas / u.yr)
+    except (TypeError, u.UnitConversionError) as error:
+        msg = (f'max_motion must be a Quantity like mas / yr, got '
+               f'{value!r:.80}')
+        raise TypeError(msg) from error
+    return as_real(float(value.value), 'max_motion', minimum=0)
 
 
 def _scaled(campaign, solved, errors):

@@ -37,6 +37,9 @@ _SETTLED = 0.03
 # The WCS counts as a linear map as far as this [pix].
 _LINEAR = 0.5
 
+# Below this significance the likelihood is sampled for errors.
+_FAINT = 12.0
+
 # Where a Gaussian of a subtracted star ends, in units of the noise.
 _FAINTEST = 1e-3
 
@@ -64,6 +67,8 @@ class Solved:
         Inverse variances of fluxes at fixed places, one image alone.
     excess : (n, E) `~numpy.ndarray`
         Products of the PSF with what is left of the data.
+    spread : (n, p, p) `~numpy.ndarray`
+        Mean squares of the likelihood about its peak; NaN if not sampled.
     groups, states : list
         The stars (g, m) of groups of each size, and their
         `~photutils_mgauss.photometry.joint_pixels.State`.
@@ -83,6 +88,7 @@ class Solved:
     pulls: np.ndarray
     weights: np.ndarray
     excess: np.ndarray
+    spread: np.ndarray
     groups: list
     states: list
 
@@ -98,21 +104,24 @@ def solve(campaign, values, fit_shape, forced, executor):
     pixels = campaign.views(values[:, None]).pixels[:, :, 0]
     groups = _groups(campaign, pixels)
     near = _has_neighbours(pixels, campaign, fit_shape)
-    own = None
-    for _ in range(_ROUNDS if near else 1):
-        state = _fit_all(campaign, values, groups, fit_shape, forced, own,
-                         executor)
+    fit_all = partial(_fit_all, groups=groups, fit_shape=fit_shape,
+                      forced=forced, executor=executor)
+    if not near:
+        return fit_all(campaign, values, own=None, sample=True)
+    own, moved = None, np.inf
+    for _ in range(_ROUNDS):
+        state = fit_all(campaign, values, own=own)
         moved = _moved(state, values)
         values = state.values
-        if not near or (own is not None and moved < _SETTLED):
+        if own is not None and moved < _SETTLED:
             break
         campaign, own = _subtract(campaign, state)
-    return state
+    return fit_all(campaign, values, own=own, sample=True)
 
 
 def _groups(campaign, pixels):
     """Return lists of stars to be fitted together, arrays of one size each."""
-    radius = _LINK * max(map(_fwhm, campaign.epochs))
+    radius = _LINK * max(map(fwhm, campaign.epochs))
     pairs = {}
     for k in range(campaign.n_images):
         seen = np.flatnonzero(np.isfinite(pixels[:, k]).all(axis=1))
@@ -143,7 +152,7 @@ def _joined(n, pairs):
                       if len(group) == size]) for size in sorted(sizes)]
 
 
-def _fwhm(epoch):
+def fwhm(epoch):
     """Return the FWHM of a Gaussian as wide as the PSF's core [pix]."""
     ny, nx = epoch.pixels.shape
     stamp = np.zeros((41, 41))
@@ -155,7 +164,7 @@ def _fwhm(epoch):
 
 def _has_neighbours(pixels, campaign, fit_shape):
     """Return whether light of a star falls into the box of another."""
-    reach = max(fit_shape) + 2 * max(map(_fwhm, campaign.epochs))
+    reach = max(fit_shape) + 2 * max(map(fwhm, campaign.epochs))
     for k in range(campaign.n_images):
         seen = np.isfinite(pixels[:, k]).all(axis=1)
         if seen.sum() > 1:
@@ -165,7 +174,8 @@ def _has_neighbours(pixels, campaign, fit_shape):
     return False
 
 
-def _fit_all(campaign, values, groups, fit_shape, forced, own, executor):
+def _fit_all(campaign, values, *, groups, fit_shape, forced, own, executor,
+             sample=False):
     """Fit all groups once, the WCS taken anew where stars have moved."""
     parts = []
     for group in groups:
@@ -176,7 +186,7 @@ def _fit_all(campaign, values, groups, fit_shape, forced, own, executor):
             fit = _fit_of(campaign, views, fit_shape, forced,
                           None if own is None else
                           own[group[todo]].transpose(0, 2, 1, 3))
-            got = _minimize(fit, executor)
+            got = _minimize(fit, executor, sample and not forced)
             done = got if done is None else _replaced(done, todo, got)
             at = np.flatnonzero(_shift(got) > _LINEAR)
             if forced or not at.size:
@@ -193,6 +203,7 @@ class _Part:
 
     state: State
     converged: np.ndarray
+    spread: np.ndarray
     pixels: np.ndarray
     start: np.ndarray
     slopes: np.ndarray
@@ -212,18 +223,20 @@ def _fit_of(campaign, views, fit_shape, forced, own):
                      own), enough.reshape(n, m))
 
 
-def _minimize(fit, executor):
+def _minimize(fit, executor, sample):
     """Return the `_Part` of a fit, in pieces spread over threads."""
     fit, enough = fit
     n, _, m, _ = fit.views.pixels.shape
     size = max(1, _CHUNK // m**2)
     pieces = [_piece(fit, slice(i, i + size)) for i in range(0, n, size)]
-    results = list(map_parallel(partial(_run, fit.joint), pieces,
+    results = list(map_parallel(partial(_run, fit.joint, sample), pieces,
                                 executor=executor, long=True))
     state = State(*(np.concatenate([getattr(one, f.name)
-                                    for one, _ in results])
+                                    for one, *_ in results])
                     for f in fields(State)))
-    return _Part(state, np.concatenate([done for _, done in results]),
+    done, spread = (np.concatenate([one[i] for one in results])
+                    for i in (1, 2))
+    return _Part(state, done, spread,
                  fit.views.places(state.values, np.arange(n)),
                  fit.views.pixels, fit.views.slopes, fit.free, enough)
 
@@ -234,8 +247,16 @@ def _piece(fit, rows):
             None if fit.own is None else fit.own[rows])
 
 
-def _run(joint, piece):
-    return JointFit(joint, *piece).minimize()
+def _run(joint, sample, piece):
+    """Return the state of a piece, who converged, and the spread."""
+    fit = JointFit(joint, *piece)
+    state, done = fit.minimize()
+    size = state.gradient.shape[1]
+    if not sample or size > state.values.shape[2]:
+        return state, done, np.full((len(done), size, size), np.nan)
+    signal = np.einsum('gem,gem->g', state.fluxes[:, joint.shared]**2,
+                       state.weights)
+    return state, done, fit.spread(state, signal < _FAINT**2)
 
 
 def _shift(part):
@@ -269,7 +290,8 @@ def _collect(campaign, values, parts):
         np.zeros((n, n_images), int), np.zeros((n, n_images)),
         np.zeros((n, n_images)), np.zeros((n, n_images, 2, 2)),
         np.zeros((n, n_images, 2)), np.zeros((n, n_images)),
-        np.zeros((n, n_images)), [group for group, _ in parts], [part.state for _, part in parts])
+        np.zeros((n, n_images)), np.full((n, p, p), np.nan),
+        [group for group, _ in parts], [part.state for _, part in parts])
     for group, part in parts:
         state = part.state
         for c in range(group.shape[1]):
@@ -286,6 +308,8 @@ def _collect(campaign, values, parts):
             out.pulls[rows] = state.slopes[:, :, c]
             out.weights[rows] = state.weights[:, :, c]
             out.excess[rows] = state.excess[:, :, c]
+        if group.shape[1] == 1:
+            out.spread[group[:, 0]] = part.spread
     return out
 
 

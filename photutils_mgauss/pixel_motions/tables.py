@@ -78,7 +78,7 @@ def _add_quality(table, campaign, solved, seen):
     table['n_obs'] = seen.sum(axis=1)
     table['n_good_obs'] = seen.sum(axis=1)
     table['visibility_periods_used'] = visibility_periods(
-        np.broadcast_to(campaign.years[:, None], seen.T.shape), seen.T)
+        campaign.years[:, None], seen.T)
     table['chi2'], table['dof'] = chi2, dof
     with np.errstate(divide='ignore', invalid='ignore'):
         table['reduced_chi2'] = chi2 / dof
