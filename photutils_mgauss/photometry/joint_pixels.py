@@ -106,7 +106,7 @@ class JointImages:
         return int(self.shared.max()) + 1
 
     def moments(self, k, boxes, places, own):
-        """Return the moments of groups in image k, without those of the sky."""
+        """Return the moments of groups in image k, the sky among them."""
         n, m = boxes.shape[:2]
         size = 3 * m + self.fit_sky
         out = kernels.GroupMoments(

@@ -390,8 +390,9 @@ def views_of(frames, plane, values, factors, velocities=None):
             factors[k], (2, p, n * m)), flat)
         xy, inverse = _pixels_of(wcs, plane, place, velocities[k])
         pixels[:, k] = xy.reshape(n, m, 2)
-        slopes[:, k] = np.einsum('nab,bpn->nap', inverse, np.broadcast_to(
-            factors[k], (2, p, n * m))).reshape(n, m, 2, p)
+        slope = np.einsum('nab,bpn->nap', inverse, np.broadcast_to(
+            factors[k], (2, p, n * m)))
+        slopes[:, k] = np.nan_to_num(slope).reshape(n, m, 2, p)
     return Views(values, pixels, slopes)
 
 

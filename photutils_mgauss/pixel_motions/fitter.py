@@ -214,8 +214,7 @@ class PixelMotionFitter:
 
     def _solve(self, campaign, listed):
         """Return the solution of the stars listed."""
-        known = np.isfinite(listed.values).all(axis=1)
-        start = campaign.views(np.nan_to_num(listed.values)[:, None]).pixels
+        start = campaign.views(listed.values[:, None]).pixels
         solved = solve(campaign, listed.values,
                        as_shape(self.fit_shape, 'fit_shape'), self.forced,
                        self.executor)
@@ -228,7 +227,6 @@ class PixelMotionFitter:
                                                 solved, errors.plain))
         table = star_table(campaign, listed, solved, errors, start[:, :, 0],
                            forced=self.forced, relative=self._is_relative())
-        table['flags'][~known] |= 4
         images = image_table(campaign, solved, errors)
         notes = campaign.notes + _coverage(campaign, solved)
         if not self.forced:

@@ -100,7 +100,6 @@ def solve(campaign, values, fit_shape, forced, executor):
     Stars whose place is not finite, or that no image shows, are left out of
     the fit and get no pixels.
     """
-    values = np.where(np.isfinite(values), values, 0.0)
     pixels = campaign.views(values[:, None]).pixels[:, :, 0]
     groups = _groups(campaign, pixels)
     near = _has_neighbours(pixels, campaign, fit_shape)
