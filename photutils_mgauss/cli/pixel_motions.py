@@ -160,7 +160,8 @@ def _read_table(path):
 
 def _summary(options, stars):
     """Return lines on what came out, and on what catalogues gave."""
-    lines = [f'{len(stars)} stars, {_solved(stars)} with proper motions']
+    lines = [f'{len(stars)} stars at the places given' if options.forced else
+             f'{len(stars)} stars, {_solved(stars)} with proper motions']
     if options.frames is not None:
         found = [file for file in Path(options.frames).glob('motions.*')
                  if file.suffix in ('.ecsv', '.fits')]

@@ -216,8 +216,9 @@ class PixelMotionFitter:
         """Return the solution of the stars listed."""
         start = campaign.views(listed.values[:, None]).pixels
         solved = solve(campaign, listed.values,
-                       as_shape(self.fit_shape, 'fit_shape'), self.forced,
-                       self.executor)
+                       as_shape(self.fit_shape, 'fit_shape'),
+                       forced=self.forced, executor=self.executor,
+                       progress_bar=self.progress_bar)
         errors = errors_of(campaign, solved)
         if campaign.estimated:
             errors = _scaled(campaign, solved, errors)

@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
+from tqdm.auto import tqdm
 
 from photutils_mgauss.kernels import Image
 from photutils_mgauss.photometry.joint_pixels import (
@@ -93,7 +94,7 @@ class Solved:
     states: list
 
 
-def solve(campaign, values, fit_shape, forced, executor):
+def solve(campaign, values, fit_shape, *, forced, executor, progress_bar):
     """
     Fit stars (n, p) to all images; return their `Solved`.
 
@@ -104,7 +105,8 @@ def solve(campaign, values, fit_shape, forced, executor):
     groups = _groups(campaign, pixels)
     near = _has_neighbours(pixels, campaign, fit_shape)
     fit_all = partial(_fit_all, groups=groups, fit_shape=fit_shape,
-                      forced=forced, executor=executor)
+                      forced=forced, spread_over=partial(
+                          _spread_over, executor, progress_bar))
     if not near:
         return fit_all(campaign, values, own=None, sample=True)
     own, moved = None, np.inf
@@ -173,7 +175,7 @@ def _has_neighbours(pixels, campaign, fit_shape):
     return False
 
 
-def _fit_all(campaign, values, *, groups, fit_shape, forced, own, executor,
+def _fit_all(campaign, values, *, groups, fit_shape, forced, own, spread_over,
              sample=False):
     """Fit all groups once, the WCS taken anew where stars have moved."""
     parts = []
@@ -185,7 +187,7 @@ def _fit_all(campaign, values, *, groups, fit_shape, forced, own, executor,
             fit = _fit_of(campaign, views, fit_shape, forced,
                           None if own is None else
                           own[group[todo]].transpose(0, 2, 1, 3))
-            got = _minimize(fit, executor, sample and not forced)
+            got = _minimize(fit, spread_over, sample and not forced)
             done = got if done is None else _replaced(done, todo, got)
             at = np.flatnonzero(_shift(got) > _LINEAR)
             if forced or not at.size:
@@ -222,14 +224,13 @@ def _fit_of(campaign, views, fit_shape, forced, own):
                      own), enough.reshape(n, m))
 
 
-def _minimize(fit, executor, sample):
+def _minimize(fit, spread_over, sample):
     """Return the `_Part` of a fit, in pieces spread over threads."""
     fit, enough = fit
     n, _, m, _ = fit.views.pixels.shape
     size = max(1, _CHUNK // m**2)
     pieces = [_piece(fit, slice(i, i + size)) for i in range(0, n, size)]
-    results = list(map_parallel(partial(_run, fit.joint, sample), pieces,
-                                executor=executor, long=True))
+    results = spread_over(partial(_run, fit.joint, sample), pieces)
     state = State(*(np.concatenate([getattr(one, f.name)
                                     for one, *_ in results])
                     for f in fields(State)))
@@ -238,6 +239,13 @@ def _minimize(fit, executor, sample):
     return _Part(state, done, spread,
                  fit.views.places(state.values, np.arange(n)),
                  fit.views.pixels, fit.views.slopes, fit.free, enough)
+
+
+def _spread_over(executor, progress_bar, work, pieces):
+    """Return what work makes of all pieces."""
+    return list(tqdm(map_parallel(work, pieces, executor=executor, long=True),
+                     desc='Fitting stars', total=len(pieces),
+                     disable=not progress_bar))
 
 
 def _piece(fit, rows):

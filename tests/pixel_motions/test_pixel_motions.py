@@ -237,7 +237,8 @@ def test_errors_of_frames_are_those_of_frames_that_move(rng):
         table = PixelMotionFitter().fit(moved, stars['id', 'ra', 'dec']).stars
         change = offsets(table, stars) - offsets(known, stars)
         expected += 100 * change[4, :4]**2
-    assert_allclose(added[4], expected, rtol=0.05)
+    # Positions of all frames together are free: nothing is added there.
+    assert_allclose(added[4], expected, rtol=0.05, atol=2e-3)
 
 
 # What goes wrong.
