@@ -24,7 +24,8 @@ def add(commands):
     """Add the command to the parser's."""
     parser = tools.command(
         commands, 'motions', 'proper motions and corrected WCS',
-        'Match the stars of two or more exposures, align the exposures on '
+        'Match the stars of two or more exposures, or of one and a '
+        'catalogue like that of Gaia, align the exposures on '
         'objects of known motion, and fit proper motions. Inputs are '
         'catalogues, of mgauss photometry or with ra, dec and their errors, '
         'or images, which are measured first. Without references the '
@@ -83,6 +84,11 @@ def _add_solution(parser):
     group.add_argument('--match-radius', type=tools.positive, metavar='MAS',
                        help='largest distance of a match (default: from the '
                             'errors)')
+    group.add_argument('--match-by', choices=('auto', 'id', 'sky',
+                                              'pattern'), default='auto',
+                       help='pattern finds wrong pointings, rolls and lists '
+                            'that are turned or mirrored '
+                            '(default: %(default)s)')
     group.add_argument('--good-flags', type=tools.not_negative,
                        default=0, metavar='BITS', help='sum of the flags of '
                        'detections to be used all the same')
@@ -134,9 +140,10 @@ def _check(options):
         raise ValueError(msg)
     tools.check_different(options.inputs)
     check_observer(options.observer, len(options.inputs))
-    if len(options.inputs) < 2:
+    if len(options.inputs) < 2 and not options.references:
         msg = (f'inputs must be at least 2 exposures, got only '
-               f'{options.inputs[0]}')
+               f'{options.inputs[0]}; one is enough with --references that '
+               'have positions of another time')
         raise ValueError(msg)
     folder = Path(options.output)
     if folder.exists() and not folder.is_dir():
@@ -329,7 +336,8 @@ def _fitter(options):
     return ProperMotionFitter(
         transform=None if transform == 'none' else transform,
         recipe=options.recipe, parallax=alone or options.parallax,
-        references=_references(options), match_by='id' if alone else 'auto',
+        references=_references(options),
+        match_by='id' if alone else options.match_by,
         systematic='fit' if systematic is None else systematic * u.mas,
         max_motion=options.max_motion * u.mas / u.yr,
         match_radius=None if radius is None else radius * u.mas)

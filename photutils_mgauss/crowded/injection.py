@@ -11,7 +11,12 @@ from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.utils.image import read_pixels, read_values, with_unit
 from photutils_mgauss.utils.robust import std_about_zero
 from photutils_mgauss.utils.star_columns import column_values
-from photutils_mgauss.utils.validation import as_floats, as_integer, as_real
+from photutils_mgauss.utils.validation import (
+    as_floats,
+    as_integer,
+    as_real,
+    as_rng,
+)
 
 # Artificial stars are drawn out to where this fraction of the smallest noise
 # is left of them.
@@ -117,13 +122,15 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     <Column name='completeness' dtype='float64' length=1>
     1.0
     """
-    rng = np.random.default_rng(rng)
+    rng = as_rng(rng)
     pixels = read_pixels(data, error, mask).with_error()
     image, variance = pixels.part()
     flux = _true_fluxes(flux, pixels.unit)
     gain = as_real(effective_gain, 'effective_gain', above=0)
     repeats = as_integer(repeats, 'repeats', minimum=1)
     separation = as_real(separation, 'separation', minimum=5)
+    radius = as_real(radius, 'radius', above=0)
+    flux_ratio = as_real(flux_ratio, 'flux_ratio', above=1)
     before = photometry(data, mask=mask, error=error)
     known = positions(before)
     renderer = MixtureRenderer(photometry.psf_model)
@@ -142,7 +149,9 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     if flux_edges is None:
         flux_edges = _flux_edges(np.asarray(stars['flux_true']))
     else:
-        flux_edges = read_values(flux_edges, 'flux_edges', pixels.unit)
+        flux_edges = as_floats(
+            read_values(flux_edges, 'flux_edges', pixels.unit), 'flux_edges',
+            shape=(None,))
     result = InjectionResult(stars, curves(stars, flux_edges))
     _with_units(stars, ('flux_true', 'flux_fit', 'flux_err'), pixels.unit)
     _with_units(result.curves, ('flux_min', 'flux_max'), pixels.unit)

@@ -106,6 +106,10 @@ def normalised(x, y, shape):
 
 def read_sample(data, stars, error, mask, radius, gain):
     """Check the exposures, cut their stars out, and say who is left out."""
+    if gain is not None and not (isinstance(gain, Real) and gain > 0):
+        msg = (f'effective_gain must be None or a number greater than 0, got '
+               f'{gain!r:.80}')
+        raise ValueError(msg)
     exposures = list(_exposures(data, stars, error, mask))
     parts = [_read_one(pixels, table, radius, gain)
              for pixels, table in exposures]
@@ -255,7 +259,8 @@ def possible_degree(degree, n_stars):
     needed = _stars_needed(degree)
     if n_stars >= needed:
         return degree
-    possible = max(d for d in range(degree) if n_stars >= _stars_needed(d))
+    possible = max(d for d in range(min(degree, n_stars))
+                   if n_stars >= _stars_needed(d))
     warnings.warn(
         f'{n_stars} stars are too few for degree {degree}, which needs '
         f'{needed}; degree {possible} is used', AstropyUserWarning,

@@ -366,6 +366,8 @@ def _as_starts(start, n, problem):
 
 def _fit_stack(problem, images, weights, starts):
     shape = images.shape[1:]
+    if problem.n_parameters > images[0].size:
+        return [_failure(FitStatus.TOO_FEW_PIXELS, image) for image in images]
     spaces = [workspace(k, shape) for k in range(problem.n_components + 1)]
     return [_fit_image(problem, spaces, *item)
             for item in zip(images, weights, starts, strict=True)]

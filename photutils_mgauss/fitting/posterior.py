@@ -291,6 +291,9 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
     unit = 1.0 if prior == 'scaled' else as_real(pixel_scale, 'pixel_scale',
                                                  above=0)
     fit = fit_mixture(image, n_components, **kwargs)
+    if fit.mixture is None:
+        msg = f'image must be one that `fit_mixture` can fit: {fit.message}'
+        raise ValueError(msg)
     if (fit.mixture.weights <= 0).any():
         msg = (f'n_components must be smaller, got {n_components}: in the '
                'least-squares solution a Gaussian has no flux')

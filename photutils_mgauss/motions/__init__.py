@@ -4,16 +4,16 @@ Proper motions from the catalogues of several epochs.
 `fitter` has `ProperMotionFitter`, which goes one way through the room. An
 `epoch` is a table with its WCS, time and observer; `assemble` hands over one
 finished `Sightings`: all epochs read, the same star found in several
-(`matching`), planes without WCS tied to the others (`ties`), and the
-reference objects of a catalogue (`references`). `prepare` makes of it what
-stays the same in a fit, with what is known beforehand (`priors`). `loop`
-solves, judges and rejects until nothing changes: a `problem` is solved for
-all stars and frames at once by `joint` and `frames`, `perspective` allows
-for stars that come nearer, `relative` fixes what nothing else does,
-`paper_recipe` is the recipe of the paper. `solution` is what comes back: its
-parts are `propagation`, `corrected_epochs`, `tables`, `bootstrap`, and
-`doubts`, what speaks against it. Nothing here knows of pixels beyond a
-position and its covariance.
+(`matching`, `pairing`, `orientation`), the `baseline` of time, planes without
+WCS tied to the others (`ties`), and the reference objects of a catalogue
+(`references`). `prepare` makes of it what stays the same in a fit, with what
+is known beforehand (`priors`). `loop` solves, judges and rejects until nothing
+changes: a `problem` is solved for all stars and frames at once by `joint` and
+`frames`, `perspective` allows for stars that come nearer, `relative` fixes
+what nothing else does, `paper_recipe` is the recipe of the paper. `solution`
+is what comes back: its parts are `propagation`, `corrected_epochs`, `tables`,
+`bootstrap`, and `doubts`, what speaks against it. Nothing here knows of pixels
+beyond a position and its covariance.
 """
 from photutils_mgauss.utils.lazy import hand_on
 

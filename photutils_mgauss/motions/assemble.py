@@ -1,17 +1,31 @@
 """From epochs and references to arrays: matched, and on one plane."""
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from astropy.table import Table
 from astropy.time import Time
 
-from photutils_mgauss.motions.epoch import check_epochs, read_epochs
+from photutils_mgauss.motions.baseline import (
+    check_baseline,
+    check_common,
+    few_in_common,
+    few_references,
+    period,
+    whole_baseline,
+)
+from photutils_mgauss.motions.epoch import (
+    brightness,
+    check_epochs,
+    read_epochs,
+)
 from photutils_mgauss.motions.matching import (
     Matches,
     find_references,
     match_epochs,
     named_references,
 )
+from photutils_mgauss.motions.orientation import find_maps, find_turns
 from photutils_mgauss.motions.references import (
     Catalogue,
     quasars,
@@ -20,8 +34,6 @@ from photutils_mgauss.motions.references import (
 from photutils_mgauss.motions.ties import Ties, tie_planes
 from photutils_mgauss.sky.observers import observer_positions, tdb
 from photutils_mgauss.sky.tangent_plane import TangentPlane
-
-COMMON = 0.5   # part of an epoch's stars in another one, if all is well
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +80,10 @@ class Sightings:
         What shows that the references are not those of these stars.
     notes : tuple of str
         Epochs that have few stars in common with the others, in sentences.
+    baseline : float
+        Years from the first to the last detection or place of a reference.
+    turns : list of (3, 3) `~numpy.ndarray` or None
+        The rotations of the sphere that corrected pointings.
     """
 
     epochs: list
@@ -89,6 +105,14 @@ class Sightings:
     radial_velocity: np.ndarray
     doubts: tuple
     notes: tuple
+    baseline: float
+    turns: list
+
+    @property
+    def single(self):
+        """Whether all epochs are of one time, but not the references."""
+        own = np.nanmax(self.years) - np.nanmin(self.years)
+        return bool(own <= period(self.baseline))
 
 
 def assemble(epochs, references, how, transform):
@@ -101,11 +125,17 @@ def assemble(epochs, references, how, transform):
     """
     epochs = check_epochs(epochs)
     table = references if isinstance(references, Table) else None
-    detections, plane, unit = read_epochs(epochs, table)
+    turns, turned = [None] * len(epochs), ()
+    if how.by == 'pattern':
+        turns, turned = find_turns(epochs, table)
+    detections, plane, unit = read_epochs(epochs, table, turns=turns)
     catalogue = None if table is None else read_catalogue(table, plane, unit)
+    check_baseline(epochs, catalogue)
     on_sky = np.array([epoch.is_sky for epoch in epochs])
-    every, matches, known = match_epochs(detections, on_sky.all(), catalogue,
-                                         how, unit)
+    orient = partial(find_maps, epochs, detections, catalogue,
+                     None if table is None else brightness(table))
+    every, matches, known, mapped = match_epochs(
+        detections, on_sky.all(), catalogue, how, unit, orient)
     years = (every.years[:, 0] if every.years.shape[1] == 1
              else np.nanmean(every.years, axis=1))
     if references is None:
@@ -115,9 +145,13 @@ def assemble(epochs, references, how, transform):
     elif known is None:
         known = find_references(catalogue, every, years, how.tolerance(unit))
     seen = known >= 0
-    stars = known[seen]
+    stars, notes = known[seen], (*turned, *mapped)
+    if len(epochs) == 1 and len(stars):
+        notes += few_references(every.plane[:, 0], known, catalogue)
     catalogue = (quasars(len(stars)) if catalogue is None
                  else catalogue.select(seen))
+    check_common(every.found, stars, catalogue)
+    notes += few_in_common(matches.seen, stars, catalogue)
     places, covariance, ties = tie_planes(every, years, catalogue, stars,
                                           on_sky, transform)
     if unit == 'mas':
@@ -130,8 +164,8 @@ def assemble(epochs, references, how, transform):
     return Sightings(epochs, plane, unit, every.ids, matches, places,
                      covariance, every.years, years, tdb(years), observer,
                      every.usable, every.flux, ties, catalogue, stars,
-                     velocity, _not_there(references, stars),
-                     _few_in_common(matches.seen))
+                     velocity, _not_there(references, stars), notes,
+                     whole_baseline(every.years, catalogue), turns)
 
 
 def _not_there(references, stars):
@@ -148,14 +182,3 @@ def _not_there(references, stars):
                 'field?')
     return (sentence,)
 
-
-def _few_in_common(seen):
-    """Return a sentence for each epoch most of whose stars are alone."""
-    shared = (seen & (seen.sum(axis=0) > 1)).sum(axis=1)
-    return tuple(
-        f'Only {some} of the {total} stars of epoch {e} were found in another '
-        'epoch: if there should be more, its pointing may be off by more '
-        'than matching looks for; see match_by and match_radius.'
-        for e, (some, total) in enumerate(zip(shared, seen.sum(axis=1),
-                                              strict=True))
-        if some < COMMON * total)

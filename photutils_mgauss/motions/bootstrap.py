@@ -11,7 +11,7 @@ import numpy as np
 
 from photutils_mgauss.motions.joint import eliminate, scaled_rows
 from photutils_mgauss.motions.problem import parts
-from photutils_mgauss.utils.validation import as_floats, as_integer
+from photutils_mgauss.utils.validation import as_floats, as_integer, as_rng
 
 BATCH = 500  # resamplings worked on at a time
 SAMPLE = 2000  # stars whose mean response to the frames is taken
@@ -55,7 +55,7 @@ def bootstrap_median(values, *, n_resamples=10000, rng=None):
     if len(values) < 2:
         msg = f'values must hold at least 2 finite ones, got {len(values)}'
         raise ValueError(msg)
-    rng = np.random.default_rng(rng)
+    rng = as_rng(rng)
     draws = [_medians(values, rng, min(BATCH, n_resamples - start))
              for start in range(0, n_resamples, BATCH)]
     return np.concatenate(draws)
@@ -100,7 +100,7 @@ class FrameDraws:
 
 def bootstrap_frames(fit, n_resamples, rng):
     """Return the `FrameDraws` of a `Fit`."""
-    rng = np.random.default_rng(rng)
+    rng = as_rng(rng)
     stars = np.flatnonzero(_tying(fit))
     problem = fit.problem.select(stars)
     basis = _determined(fit)

@@ -23,12 +23,18 @@ def correct_epochs(result):
     sound = result.state.used & ~result.state.untied
     pairs = [correct_epoch(
         epoch, Correction(sightings.plane, transform, coefficients,
-                          observer_velocity(epoch.observer)), tie,
-        rows[inside])
-             for epoch, coefficients, tie, rows, inside in zip(
-                 sightings.epochs, result.state.maps, sightings.ties.maps,
-                 sightings.matches.rows, sound, strict=True)]
+                          _velocity(epoch, turn), turn), tie, rows[inside])
+             for epoch, coefficients, turn, tie, rows, inside in zip(
+                 sightings.epochs, result.state.maps, sightings.turns,
+                 sightings.ties.maps, sightings.matches.rows, sound,
+                 strict=True)]
     return tuple(list(some) for some in zip(*pairs, strict=True))
+
+
+def _velocity(epoch, turn):
+    """Return the velocity of an epoch's observer in the turned axes."""
+    velocity = observer_velocity(epoch.observer)
+    return velocity if velocity is None or turn is None else turn @ velocity
 
 
 def correct_epoch(epoch, correction, tie, rows):

@@ -1,6 +1,7 @@
 """What makes a solution doubtful, in sentences that say what to look at."""
 import numpy as np
 
+from photutils_mgauss.motions.stacked import variance_2x2
 from photutils_mgauss.sky.space_motion import NO_ERROR
 
 FAR = 7.0     # times the detections' errors: no systematic error is so large
@@ -90,11 +91,11 @@ def _ties(fit):
 
 def _floor_ratio(fit, e):
     """Return the floor of an epoch over the error of a typical detection."""
-    xx, _, yy = fit.setup.sightings.covariance[:, e,
-                                               fit.state.used[e] & _ties(fit)]
-    if not xx.size:
+    variance = variance_2x2(fit.setup.sightings.covariance[
+        :, e, fit.state.used[e] & _ties(fit)])
+    if not variance.size:
         return 0.0
-    return np.sqrt(np.max(fit.state.floor[e]) / np.median((xx + yy) / 2))
+    return np.sqrt(np.max(fit.state.floor[e]) / np.median(variance))
 
 
 def _misfit(fit):

@@ -18,7 +18,12 @@ from photutils_mgauss.sky.observers import (
     observer_velocity,
     remove_aberration,
 )
-from photutils_mgauss.sky.tangent_plane import TangentPlane, unit_vectors
+from photutils_mgauss.sky.tangent_plane import (
+    MAS,
+    TangentPlane,
+    local_axes,
+    unit_vectors,
+)
 from photutils_mgauss.sky.wcs import (
     check_celestial,
     pixel_jacobian,
@@ -32,7 +37,12 @@ COLUMNS = {
     'x_err': ('x_err', 'x_error'), 'y_err': ('y_err', 'y_error'),
     'ra_err': ('ra_error', 'ra_err'), 'dec_err': ('dec_error', 'dec_err'),
     'flux': ('flux_fit', 'flux'),
+    'magnitude': ('mag', 'phot_g_mean_mag'),
+    'along_err': ('along_error', 'along_err'),
 }
+# What is not measured across a scan, in errors along it: far beyond what
+# counts as a measurement, near enough that covariances can be inverted.
+ACROSS = 1e5
 
 
 def names_of(key):
@@ -55,7 +65,11 @@ class Epoch:
           optionally the covariance ``xy_cov`` [pix^2]; or
         * ICRS positions: ``ra``, ``dec`` [deg], ``ra_error``, ``dec_error``
           [mas], the first with the cosine of the declination in it, as in
-          the Gaia catalogue (``ra_err`` and ``dec_err`` will do).
+          the Gaia catalogue (``ra_err`` and ``dec_err`` will do); or
+        * scans that measure one direction: ``along`` [mas], the place along
+          the scan from ``ra``, ``dec``, its error ``along_error``, and
+          ``scan_angle`` [deg], the direction of the scan from north through
+          east. Each is one measurement.
 
         Optional columns: ``id`` (any type, unique), ``flux_fit``,
         ``radial_velocity`` [km/s], and ``time``, the time of each row.
@@ -107,7 +121,7 @@ class Epoch:
         if self.wcs is not None:
             check_celestial(self.wcs)
         _check_observer(self.observer)
-        _check_columns(self.table, self.is_pixels)
+        _check_columns(self.table, self.is_pixels, self.is_scan)
         _check_scale(self)
         _check_time(self)
 
@@ -124,6 +138,11 @@ class Epoch:
         has_xy = find_column(self.table, names_of('x')) is not None
         has_sky = 'ra' in self.table.colnames
         return has_xy and (self.wcs is not None or not has_sky)
+
+    @property
+    def is_scan(self):
+        """Whether positions are measured in one direction each."""
+        return 'along' in self.table.colnames and not self.is_pixels
 
     @property
     def is_sky(self):
@@ -182,9 +201,12 @@ def _check_observer(observer):
     _known_observer(observer)
 
 
-def _check_columns(table, is_pixels):
-    wanted = (('x', 'y', 'x_err', 'y_err') if is_pixels
-              else ('ra', 'dec', 'ra_err', 'dec_err'))
+def _check_columns(table, is_pixels, is_scan):
+    wanted = ('ra', 'dec', 'ra_err', 'dec_err')
+    if is_pixels:
+        wanted = ('x', 'y', 'x_err', 'y_err')
+    elif is_scan:
+        wanted = ('ra', 'dec', 'along', 'along_err', 'scan_angle')
     for key in wanted:
         names = names_of(key)
         if find_column(table, names) is None:
@@ -272,10 +294,38 @@ def sky_vectors(epoch):
         vectors = pixel_to_vectors(epoch.wcs, x, y)
     else:
         vectors = table_vectors(epoch.table)
+    if epoch.is_scan:
+        vectors = _along_the_scan(epoch.table, vectors)
     velocity = observer_velocity(epoch.observer)
     if velocity is None:
         return vectors
     return remove_aberration(vectors, velocity)
+
+
+def _along_the_scan(table, vectors):
+    """Return directions (3, n) moved along the scans by what was measured."""
+    east, north = local_axes(vectors)
+    sine, cosine = _scan_directions(table)
+    step = numbers(table, 'along', u.mas) / MAS
+    moved = vectors + step * (sine * east + cosine * north)
+    return moved / np.sqrt(1 + step**2)
+
+
+def _scan_directions(table):
+    angle = np.radians(numbers(table, 'scan_angle', u.deg))
+    return np.sin(angle), np.cos(angle)
+
+
+def _scan_covariance(table):
+    """Return xx, xy, yy of scans, which say nothing across their way."""
+    error = numbers(table, 'along_err', u.mas)
+    sine, cosine = _scan_directions(table)
+    across = (ACROSS * error)**2
+    along = error**2 - across
+    covariance = np.stack([across + along * sine**2, along * sine * cosine,
+                           across + along * cosine**2])
+    return np.where((error > 0) & np.isfinite(error + sine), covariance,
+                    np.nan)
 
 
 def table_vectors(table):
@@ -285,13 +335,22 @@ def table_vectors(table):
                         np.where(np.abs(dec) <= 90, dec, np.nan))
 
 
+def brightness(table):
+    """Return numbers (n,) that grow with the flux, NaN where unknown."""
+    for key, sign in (('flux', 1), ('magnitude', -1)):
+        values = numbers(table, key)
+        if np.isfinite(values).any():
+            return sign * values
+    return values
+
+
 def pixels(epoch):
     """Return x and y [pix] of an epoch."""
     return numbers(epoch.table, 'x', u.pix), numbers(epoch.table, 'y', u.pix)
 
 
 def check_epochs(epochs):
-    """Return the epochs as a list, or raise for what cannot be fitted."""
+    """Return the epochs as a list, or raise for what are none."""
     if isinstance(epochs, Epoch):
         msg = 'epochs must be a sequence of Epoch, got a single one'
         raise TypeError(msg)
@@ -301,18 +360,13 @@ def check_epochs(epochs):
             msg = (f'epochs must be a sequence of Epoch, got '
                    f'{type(epoch).__name__}')
             raise TypeError(msg)
-    if len(epochs) < 2:
-        msg = f'epochs must be at least 2, got {len(epochs)}'
-        raise ValueError(msg)
-    years = [epoch.mean_year for epoch in epochs]
-    if max(years) - min(years) <= 0:
-        msg = (f'epochs must have a time baseline, got all '
-               f'{len(years)} at {years[0]:.6f}')
+    if not epochs:
+        msg = 'epochs must be at least 2, got 0'
         raise ValueError(msg)
     return epochs
 
 
-def read_epochs(epochs, references=None):
+def read_epochs(epochs, references=None, *, turns=None):
     """
     Return what epochs say, in one plane.
 
@@ -321,6 +375,9 @@ def read_epochs(epochs, references=None):
     epochs : list of `Epoch`
     references : `~astropy.table.Table`, optional
         Reference objects, whose unit counts where nothing is on the sky.
+    turns : list of (3, 3) `~numpy.ndarray` or None, optional
+        Rotations of the sphere that correct pointings, None for those that
+        are right.
 
     Returns
     -------
@@ -331,11 +388,15 @@ def read_epochs(epochs, references=None):
     """
     vectors = [sky_vectors(epoch) if epoch.is_sky else None
                for epoch in epochs]
+    if turns is not None:
+        vectors = [vector if turn is None else turn @ vector
+                   for vector, turn in zip(vectors, turns, strict=True)]
     plane = _common_plane(vectors)
     unit = 'mas' if plane else _common_unit(epochs, references)
     # Popped, so that a million directions are kept no longer than needed.
-    detections = [read_epoch(epoch, plane, vectors.pop(0))
-                  for epoch in epochs]
+    turns = [None] * len(epochs) if turns is None else turns
+    detections = [read_epoch(epoch, plane, vectors.pop(0), turn)
+                  for epoch, turn in zip(epochs, turns, strict=True)]
     return detections, plane, unit
 
 
@@ -365,12 +426,13 @@ def _common_unit(epochs, references):
     return units.pop()
 
 
-def read_epoch(epoch, plane=None, vectors=None):
+def read_epoch(epoch, plane=None, vectors=None, turn=None):
     """
     Return the `Detections` of an epoch.
 
     ``plane`` is the common `TangentPlane`, and ``vectors`` the directions
     already computed; both None where nothing is known about the sky.
+    ``turn`` is the rotation (3, 3) they had, if any.
     """
     years = np.asarray(epoch.years, dtype=float)
     ids, flux = _ids(epoch.table), numbers(epoch.table, 'flux')
@@ -379,7 +441,7 @@ def read_epoch(epoch, plane=None, vectors=None):
         positions, covariance = _read_plane(epoch)
     else:
         positions = plane.project(vectors)
-        covariance = _sky_covariance(epoch, plane, positions)
+        covariance = _sky_covariance(epoch, plane, positions, turn)
     found = np.isfinite(positions).all(axis=0) & np.isfinite(years)
     return Detections(ids, np.where(found, positions, np.nan), covariance,
                       years, flux, velocity, found,
@@ -404,17 +466,25 @@ def _covariance(table, dx, dy, scale=1.0, unit=u.pix**2):
     return np.where(good, np.stack([dx * dx, cross, dy * dy]), np.nan)
 
 
-def _sky_covariance(epoch, plane, positions):
+def _sky_covariance(epoch, plane, positions, turn):
     """Carry the errors of pixels or sky positions to the plane."""
     keys, unit = (('x_err', 'y_err'), u.pix) if epoch.is_pixels else (
         ('ra_err', 'dec_err'), u.mas)
-    errors = (numbers(epoch.table, key, unit) for key in keys)
-    covariance = _covariance(epoch.table, *errors, unit=unit**2)
+    if epoch.is_scan:
+        covariance = _scan_covariance(epoch.table)
+    else:
+        errors = (numbers(epoch.table, key, unit) for key in keys)
+        covariance = _covariance(epoch.table, *errors, unit=unit**2)
     if epoch.is_pixels:
         x, y = pixels(epoch)
-        jacobian = pixel_jacobian(epoch.wcs, plane, x, y)
-    else:
+        jacobian = pixel_jacobian(epoch.wcs, plane, x, y, turn)
+    elif turn is None:
         jacobian = plane.local_jacobian(positions)
+    else:  # The errors are along east and north as the table has them.
+        axes = local_axes(turn.T @ plane.deproject(positions))
+        jacobian = np.stack([plane.displacement(
+            positions, np.tensordot(turn, axis, axes=1)) for axis in axes],
+            axis=1)
     return sandwich_2x2(jacobian, covariance)
 
 

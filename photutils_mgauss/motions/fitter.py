@@ -18,6 +18,7 @@ from photutils_mgauss.sky.transforms import Transform
 from photutils_mgauss.utils.validation import as_choice, as_real
 
 RECIPES = ('joint', 'two-step', 'paper')
+MATCH_BY = ('auto', 'id', 'sky', 'pattern')
 
 
 class ProperMotionFitter:
@@ -44,7 +45,8 @@ class ProperMotionFitter:
         ``parallax``, their ``_error`` and ``_corr``, ``ref_epoch``,
         ``radial_velocity``, and ``class``: 'qso' or 'galaxy' (motion and
         parallax zero), 'star', or 'position' (motion unknown; the default
-        for rows without motion). Or identifiers of quasars and galaxies; or
+        for rows without motion). Positions with errors count as another
+        epoch. Or identifiers of quasars and galaxies; or
         the name of a boolean column of the epochs that marks them. None
         makes all motions relative to the mean of the stars.
     ref_epoch : `~astropy.time.Time` or float, optional
@@ -55,9 +57,12 @@ class ProperMotionFitter:
         value, or one for each epoch).
     executor : `~concurrent.futures.Executor`, optional
         Where the work is done; the default is threads on all processors.
-    match_by : {'auto', 'id', 'sky'}, optional
+    match_by : {'auto', 'id', 'sky', 'pattern'}, optional
         How epochs are matched. 'auto' uses the column ``id`` if all epochs
-        have one and equal identifiers are at equal places.
+        have one and equal identifiers are at equal places, else positions,
+        as 'sky' does. 'pattern' first finds where each epoch looks by the
+        asterisms of its bright stars: for lists without WCS, and WCS with a
+        pointing off by up to the field of view or a wrong roll.
     match_radius : `~astropy.units.Quantity`, optional
         Largest distance of a match. The default follows from the errors
         and ``max_motion``.
@@ -137,7 +142,8 @@ class ProperMotionFitter:
         Parameters
         ----------
         epochs : sequence of `Epoch`
-            At least two, in any order.
+            At least two, in any order; or one, or many of one time, with
+            references that have positions of another time.
 
         Returns
         -------
@@ -146,8 +152,9 @@ class ProperMotionFitter:
         Raises
         ------
         ValueError
-            If the epochs have no time baseline or no stars in common, or
-            an epoch has fewer references than its map needs.
+            If the epochs have no time baseline, with each other or with
+            positions of references, or no stars in common, or an epoch has
+            fewer references than its map needs.
         """
         options = self._options()
         sightings = assemble(epochs, self.references, self._how_to_match(),
@@ -164,7 +171,7 @@ class ProperMotionFitter:
                        'ref_epoch')
 
     def _how_to_match(self):
-        as_choice(self.match_by, 'match_by', ('auto', 'id', 'sky'))
+        as_choice(self.match_by, 'match_by', MATCH_BY)
         _check_quantity(self.max_motion, 'max_motion', u.mas / u.yr)
         if self.match_radius is not None:
             _check_quantity(self.match_radius, 'match_radius', u.mas, u.pix)

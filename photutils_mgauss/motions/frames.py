@@ -93,6 +93,12 @@ def _parallax_family(transform, factors):
     return family[:, allowed]
 
 
+def fixed_frames(problem):
+    """Return the `Frames` of a problem whose maps may not change."""
+    shape = (problem.n_epochs, 2, problem.transform.n_terms)
+    return Frames(np.zeros(shape), np.zeros((np.prod(shape), 0)), ())
+
+
 def solve_frames(problem, reduced, *, relative=False):
     """
     Return the `Frames` of a problem from its `Reduced` equations.
@@ -104,8 +110,6 @@ def solve_frames(problem, reduced, *, relative=False):
     transform = problem.transform
     n_epochs, size, _ = reduced.direct.shape
     shape = (n_epochs, 2, size // 2)
-    if transform.n_parameters == 0:
-        return Frames(np.zeros(shape), np.zeros((n_epochs * size, 0)), ())
     free = np.kron(np.eye(n_epochs), transform.generators)
     matrix, rhs = free.T @ reduced.matrix @ free, free.T @ reduced.rhs
     information = np.einsum('ij,ij->j', free,

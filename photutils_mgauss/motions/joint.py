@@ -42,6 +42,7 @@ from photutils_mgauss.motions.stacked import (
     Summed,
     apply,
     apply_transposed,
+    dimensions_2x2,
     gram,
     inverse_factor,
     invert_2x2,
@@ -112,6 +113,22 @@ def _normal_matrices(columns, weighted, problem):
             normal[k, j] = normal[j, k] = (_sum(x, columns[j][0])
                                            + _sum(y, columns[j][1]))
     return normal
+
+
+def measured_ranks(problem, *, tolerance=1e-9):
+    """
+    Return how many parameters of each star its detections measure, (n,).
+
+    Eigenvalues of the normal matrix, scaled to a unit diagonal, below the
+    ``tolerance`` are none.
+    """
+    columns = problem.columns()
+    weighted = [_weigh(problem.weights, column) for column in columns]
+    normal = np.moveaxis(_normal_matrices(columns, weighted, problem), 2, 0)
+    scale = np.sqrt(np.einsum('nkk->nk', normal))
+    scale = 1 / np.where(scale > 0, scale, np.inf)
+    normal = normal * scale[:, :, None] * scale[:, None, :]
+    return np.sum(np.linalg.eigvalsh(normal) > tolerance, axis=1)
 
 
 def _add_priors(priors, normal, moment):
@@ -265,7 +282,8 @@ def _judge(residuals, predicted, weights):
         a, b, c = invert_2x2(*left)
         chi2 = a * x * x + 2 * b * x * y + c * y * y
     return tuple(np.where(good, values, np.nan) for good, values in (
-        (sound, chi2), (used, raw), (used, 2 - leverage)))
+        (sound, chi2), (used, raw),
+        (used, dimensions_2x2(weights) - leverage)))
 
 
 def _times(column, value):
@@ -418,6 +436,9 @@ def _leak(problem):
     weighted = [_weigh(problem.weights, column) for column in columns]
     normal = _normal_matrices(columns, weighted, problem)
     factor, solved = inverse_factor(normal[:4, :4])
+    if not solved.all():
+        _add_known(problem.priors, normal, solved)
+        factor, solved = inverse_factor(normal[:4, :4])
     inverse = gram(factor)
     leak = apply(inverse, normal[:4, 4])
     corner = normal[4, 4] - np.sum(normal[:4, 4] * leak, axis=0)
@@ -430,3 +451,9 @@ def _leak(problem):
     motion[:, ~solved] = np.nan
     inverse = problem.plane.local_inverse(problem.origin)
     return correlation, np.einsum('ijn,jn->in', inverse, motion)
+
+
+def _add_known(priors, normal, solved):
+    """Add what is known of stars that are not solved without."""
+    which = np.flatnonzero(~solved[priors.stars])
+    normal[:4, :4, priors.stars[which]] += priors.precision[:4, :4, which]

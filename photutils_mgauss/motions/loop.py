@@ -4,9 +4,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri, ndtr
 
-from photutils_mgauss.motions.frames import Frames, solve_frames
+from photutils_mgauss.motions.frames import (
+    Frames,
+    fixed_frames,
+    solve_frames,
+)
 from photutils_mgauss.motions.joint import (
     Estimates,
+    measured_ranks,
     parallax_leak,
     reduce_all,
     solve_all,
@@ -14,12 +19,14 @@ from photutils_mgauss.motions.joint import (
 )
 from photutils_mgauss.motions.perspective import swerved
 from photutils_mgauss.motions.prepare import Setup, State
+from photutils_mgauss.motions.priors import weak_priors
 from photutils_mgauss.motions.problem import MotionProblem
 from photutils_mgauss.motions.relative import remove_mean_fields
 from photutils_mgauss.motions.stacked import dimensions_2x2, invert_2x2
 
 CONVERGED = 1e-3  # of the median error of a detection
 MAX_ITERATIONS = 40
+WEAK = 1e4  # errors of a detection [per yr]: a prior that says nothing
 SIGNIFICANT = 2.0  # standard deviations that call for a floor
 FEW, MANY = 10, 0.25  # detections of a star, and their part, to be rejected
 
@@ -77,7 +84,9 @@ def finished(setup, state, problem, frames, estimates):
 def pose(setup, state):
     """Return the `MotionProblem` of the present maps, masks and floors."""
     sightings, transform = setup.sightings, setup.transform
-    ties, priors = _ties(setup, state), setup.priors.without(state.dropped)
+    ties = _ties(setup, state)
+    priors = setup.priors.without(state.dropped).with_others(
+        setup.places.of(state.dropped))
     offsets = np.empty_like(sightings.places)
     weights = np.empty_like(sightings.covariance)
     for e, coefficients in enumerate(state.maps):
@@ -117,8 +126,11 @@ def _ties(setup, state):
 def _step(setup, state):
     """Solve for the frames once; return problem, frames and new maps."""
     problem = pose(setup, state)
-    reduced = reduce_all(problem, setup.options.executor)
-    frames = solve_frames(problem, reduced, relative=setup.relative)
+    if setup.transform.n_parameters == 0:
+        frames = fixed_frames(problem)
+    else:
+        reduced = reduce_all(problem, setup.options.executor)
+        frames = solve_frames(problem, reduced, relative=setup.relative)
     maps = np.stack([setup.transform.project(one)
                      for one in state.maps + frames.correction])
     swerve = state.swerve
@@ -206,14 +218,21 @@ def _review(setup, state, problem, frames):
         return replace(state, dropped=np.union1d(state.dropped,
                                                  dropped)), True
     estimates = solve(setup, problem, frames, judge=True)
+    each = _measured_numbers(problem)
     bad = worst_outliers(estimates.chi2, state.used,
-                         _spare(problem, state) & ~state.crooked,
-                         setup.options.clip)
+                         _spare(problem, each) & ~state.crooked,
+                         chi2_limits(setup.options.clip, each))
     if bad.any():
         return _rejected(setup, state, bad), True
     untied = state.untied | _inconsistent(setup, problem, estimates)
     return replace(state, untied=untied), bool(
         (untied & ~state.untied).any())
+
+
+def _measured_numbers(problem):
+    """Return how many numbers each detection measures, (E, n)."""
+    return np.where(problem.weights[0] + problem.weights[2] > 0,
+                    dimensions_2x2(problem.weights), 0)
 
 
 def _rejected(setup, state, bad):
@@ -234,7 +253,7 @@ def _rejected(setup, state, bad):
 
 def _inconsistent(setup, problem, estimates):
     """Return stars (n,) that no more rejections can make agree."""
-    dof = 2 * (problem.weights[0] > 0).sum(axis=0) - problem.n_parameters
+    dof = _measured_numbers(problem).sum(axis=0) - problem.n_parameters
     chi2 = np.nansum(estimates.raw, axis=0)
     out = (dof > 0) & (chi2 > chi2_limit(setup.options.clip,
                                          np.maximum(dof, 1)))
@@ -244,9 +263,13 @@ def _inconsistent(setup, problem, estimates):
     return out
 
 
-def _spare(problem, state):
-    """Return the stars that can lose a detection and still be judged."""
-    known = 2 * state.used.sum(axis=0) + problem.ranks
+def _spare(problem, each):
+    """
+    Return the stars that can lose a detection and still be judged.
+
+    ``each`` (E, n) is how many numbers a detection measures, 0 where unused.
+    """
+    known = each.sum(axis=0) + problem.ranks
     return known - 2 >= problem.n_parameters + 2
 
 
@@ -265,14 +288,34 @@ def _discrepant(setup, problem, frames):
     bound, free = (
         solve(setup, one, frames, residuals=True).total
         for one in (alone, alone.unbound))
+    open_ = ~np.isfinite(free)
+    tested = alone.ranks
+    if open_.any():
+        free[open_], missing = _barely_known(setup, alone, frames, open_)
+        tested[open_] -= np.minimum(missing, tested[open_])
     rise = bound - free
-    limit = chi2_limit(setup.options.clip, alone.ranks)
+    limit = chi2_limit(setup.options.clip, tested)
     worst = np.nan_to_num(np.divide(rise, limit, where=limit > 0,
                                     out=np.zeros_like(rise)), nan=0.0)
     # A few at a time: one bad reference pulls the frame from the others.
     most = max(1, len(stars) // 20)
     chosen = np.argsort(worst)[::-1][:most]
     return stars[chosen[worst[chosen] > 1]]
+
+
+def _barely_known(setup, problem, frames, which):
+    """
+    Return chi-squares of stars whose detections do not suffice alone.
+
+    They are those of the best parameters of all, which a prior finds that is
+    too weak to count; and the number of parameters left open.
+    """
+    some = problem.unbound.select(np.flatnonzero(which))
+    missing = some.n_parameters - measured_ranks(some)
+    sigma = WEAK * np.sqrt(setup.typical_variance)
+    weak = replace(some, priors=weak_priors(some.n_stars, some.n_parameters,
+                                            sigma))
+    return solve(setup, weak, frames, residuals=True).total, missing
 
 
 def _floors(setup, state, problem, frames, *, robust=False):
@@ -297,26 +340,33 @@ def chi2_limit(clip, dof):
     return chdtri(dof, 2 * ndtr(-clip))
 
 
-def worst_outliers(chi2, used, spare, clip):
+def chi2_limits(clip, dimensions):
+    """Return the `chi2_limit` of 1 or 2 degrees of freedom for each."""
+    one, two = chi2_limit(clip, np.array([1, 2]))
+    return np.where(dimensions == 1, one, two)
+
+
+def worst_outliers(chi2, used, spare, limit):
     """
     Return which detections to reject now, (E, n): each star's worst.
+
+    The worst is farthest beyond the ``limit`` (E, n) of its chi-square.
 
     Only one of a star's goes at a time, or a twentieth of many, because a
     bad one spoils the residuals of the good; and only where ``spare`` (n,)
     says the star has detections enough to tell the bad one.
     """
-    limit = chi2_limit(clip, 2)
-    chi2 = np.where(used, np.nan_to_num(chi2, nan=0.0), 0.0)
-    worst = chi2.argmax(axis=0)
+    excess = np.where(used, np.nan_to_num(chi2, nan=0.0), 0.0) / limit
+    worst = excess.argmax(axis=0)
     out = np.zeros(used.shape, dtype=bool)
     stars = np.arange(used.shape[1])
-    out[worst, stars] = (chi2[worst, stars] > limit) & spare
+    out[worst, stars] = (excess[worst, stars] > 1) & spare
     most = len(used) // 20
     if most > 1:
         # Those about as bad as the worst, which has spoilt the others.
-        rank = chi2.argsort(axis=0)[::-1].argsort(axis=0)
+        rank = excess.argsort(axis=0)[::-1].argsort(axis=0)
         out |= ((rank < used.sum(axis=0) // 20) & spare
-                & (chi2 > np.maximum(limit, chi2.max(axis=0) / 4)))
+                & (excess > np.maximum(1, excess.max(axis=0) / 4)))
     return out
 
 
@@ -331,7 +381,8 @@ def floor_variance(residuals, covariance, expected, floor, *,
     covariance : (3, n) `~numpy.ndarray`
         Covariances of the measurements without the floor.
     expected : (n,) `~numpy.ndarray`
-        Expected chi-square of each, 2 minus its leverage.
+        Expected chi-square of each, 2 minus its leverage, or 1 for a
+        measurement in one direction.
     floor : float
         The present variance.
     robust : bool, optional
@@ -347,6 +398,9 @@ def floor_variance(residuals, covariance, expected, floor, *,
     good &= expected > 0.1
     residuals, covariance = residuals[:, good], covariance[:, good]
     expected = expected[good]
+    # Medians of chi-squares of one and two degrees of freedom.
+    middle = np.where(dimensions_2x2(covariance) == 1, chdtri(1, 0.5),
+                      np.log(2))
     if expected.sum() < 4:
         return 0.0
 
@@ -356,7 +410,7 @@ def floor_variance(residuals, covariance, expected, floor, *,
         x, y = residuals
         chi2 = a * x * x + 2 * b * x * y + c * y * y
         if robust:
-            return np.median(chi2 / expected) - np.log(2)
+            return np.log(2) * (np.median(chi2 / (expected * middle)) - 1)
         return chi2.sum() - expected.sum()
     # An excess that good errors alone would show every twentieth time is
     # not worth a floor, which would only make all errors too large.
@@ -366,6 +420,6 @@ def floor_variance(residuals, covariance, expected, floor, *,
     if excess(0.0) <= SIGNIFICANT * noise:
         return 0.0
     for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
+        half = (low + high) / 2
+        low, high = (half, high) if excess(half) > 0 else (low, half)
     return (low + high) / 2

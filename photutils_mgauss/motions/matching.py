@@ -1,61 +1,25 @@
 """
 Which rows of several exposures are the same star.
 
-Rows are matched by an identifier, or by position: one to one, nearest first,
-within a tolerance that comes from the errors, the time between the exposures
-and the known motions. Stars missing from some exposures are kept.
+Rows are matched by an identifier, or by position (``pairing``).
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import astropy.units as u
 import numpy as np
-from scipy.spatial import cKDTree
 
+from photutils_mgauss.motions.baseline import COMMON
 from photutils_mgauss.motions.epoch import Detections
-from photutils_mgauss.utils.robust import std_about_zero
+from photutils_mgauss.motions.pairing import (
+    Known,
+    Matches,
+    Tolerance,
+    match_positions,
+)
+from photutils_mgauss.motions.stacked import variance_2x2
+from photutils_mgauss.sky.space_motion import NO_ERROR
 
-# Field stars that tie one exposure to the next one before it is matched.
-SAMPLE = 20000
-N_SIGMA = 5.0
 POINTING = 2000.0  # mas: offsets of exposures that are looked for
-
-
-@dataclass(frozen=True, eq=False)
-class Matches:
-    """
-    The rows of E exposures that belong to each of n stars.
-
-    Parameters
-    ----------
-    rows : (E, n) int `~numpy.ndarray`
-        Row of each star in the table of each exposure, -1 where missing.
-    ambiguous : (n,) bool `~numpy.ndarray`
-        Whether another pairing lay within the tolerance too.
-    """
-
-    rows: np.ndarray
-    ambiguous: np.ndarray
-
-    @property
-    def seen(self):
-        """Where stars have a row, (E, n)."""
-        return self.rows >= 0
-
-    def take(self, values, fill=np.nan):
-        """
-        Return one array per exposure, (..., n_e), as (..., E, n).
-
-        Missing rows are filled with ``fill``.
-        """
-        leading = values[0].shape[:-1]
-        kind = np.result_type(*values, type(fill))
-        out = np.empty((*leading, *self.rows.shape), dtype=kind)
-        for e, (value, rows) in enumerate(
-                zip(values, self.rows, strict=True)):
-            if value.shape[-1]:
-                out[..., e, :] = value[..., rows]
-            out[..., e, rows < 0] = fill
-        return out
 
 
 def match_ids(ids):
@@ -87,250 +51,6 @@ def match_ids(ids):
     return Matches(rows, np.zeros(len(names), dtype=bool)), names[order]
 
 
-@dataclass(eq=False)
-class _Master:
-    """The stars known so far, where and when each was last seen."""
-
-    position: np.ndarray   # (2, n)
-    sigma: np.ndarray      # (n,)
-    year: np.ndarray       # (n,)
-    motion: np.ndarray     # (2, n), 0 where unknown
-    known: np.ndarray      # (n,) whether the motion is known
-    ambiguous: np.ndarray  # (n,)
-
-    def at(self, year):
-        return self.position + self.motion * (year - self.year)
-
-    def update(self, stars, position, sigma, year):
-        self.position[:, stars] = position
-        self.sigma[stars] = sigma
-        self.year[stars] = year
-
-    def extend(self, position, sigma, year):
-        n = position.shape[1]
-        self.position = np.hstack([self.position, position])
-        self.sigma = np.append(self.sigma, sigma)
-        self.year = np.append(self.year, np.full(n, year))
-        self.motion = np.hstack([self.motion, np.zeros((2, n))])
-        self.known = np.append(self.known, np.zeros(n, dtype=bool))
-        self.ambiguous = np.append(self.ambiguous, np.zeros(n, dtype=bool))
-
-
-@dataclass(frozen=True)
-class Tolerance:
-    """
-    How far apart, in frame units, two sightings of a star may be.
-
-    Parameters
-    ----------
-    radius : float or None
-        One radius for all pairs; None takes it from the errors: five times
-        both standard errors, ``max_motion`` times the years between them
-        where the motion is not known, and the residuals of the frames.
-    max_motion : float
-        Largest unknown motion [unit / yr].
-    pointing : float
-        Largest offset between exposures [unit].
-    """
-
-    radius: float | None
-    max_motion: float
-    pointing: float
-
-    def between(self, master, stars, sigma, year, slack):
-        """Return the radius for each pair of a known star and a row."""
-        if self.radius is not None:
-            return np.full(len(stars), self.radius)
-        years = np.abs(year - master.year[stars])
-        motion = np.where(master.known[stars], 0, self.max_motion * years)
-        error = N_SIGMA * np.hypot(sigma, master.sigma[stars])
-        return error + motion + slack
-
-
-def match_positions(places, sigmas, years, tolerance, catalogue=None):
-    """
-    Match exposures by position.
-
-    Parameters
-    ----------
-    places : list of (2, n_e) `~numpy.ndarray`
-        Positions in one plane; NaN rows become stars of their own.
-    sigmas : list of (n_e,) `~numpy.ndarray`
-        Standard errors of the positions; NaN counts as 0.
-    years : (E,) sequence of float
-        Times of the exposures [yr].
-    tolerance : `Tolerance`
-    catalogue : (position, motion, year), optional
-        Stars whose motions are known: (2, n), (2, n) and (n,).
-
-    Returns
-    -------
-    matches : `Matches`
-        The stars of the catalogue come first, in its order.
-    """
-    master = _start(catalogue)
-    rows = [None] * len(places)
-    for e in np.argsort(years, kind='stable'):
-        sigma = np.nan_to_num(sigmas[e], nan=0.0, posinf=0.0)
-        rows[e] = _match_one(master, places[e], sigma, years[e], tolerance)
-    table = np.full((len(places), len(master.year)), -1)
-    for e, stars in enumerate(rows):
-        table[e, stars] = np.arange(len(stars))
-    return Matches(table, master.ambiguous)
-
-
-def _start(catalogue):
-    if catalogue is None:
-        catalogue = np.empty((2, 0)), np.empty((2, 0)), np.empty(0)
-    position, motion, year = catalogue
-    n = position.shape[1]
-    known = np.isfinite(motion).all(axis=0)
-    return _Master(position.copy(), np.zeros(n), np.array(year, dtype=float),
-                   np.where(known, motion, 0.0), known,
-                   np.zeros(n, dtype=bool))
-
-
-def _match_one(master, places, sigma, year, tolerance):
-    """Return the star of each row, adding the rows that are new stars."""
-    stars = np.full(places.shape[1], -1)
-    finite = np.flatnonzero(np.isfinite(places).all(axis=0))
-    usable = np.isfinite(master.position).all(axis=0)
-    if usable.any() and len(finite):
-        known = np.flatnonzero(usable)
-        tree = cKDTree(master.at(year)[:, known].T)
-        moved, slack = _tie(tree, places[:, finite], tolerance)
-        stars[finite] = _pair(master, tree, known, moved, sigma[finite],
-                              year, tolerance, slack)
-        places = places.copy()
-        places[:, finite] = moved
-    old = stars >= 0
-    master.update(stars[old], places[:, old], sigma[old], year)
-    new = np.flatnonzero(~old)
-    stars[new] = len(master.year) + np.arange(len(new))
-    master.extend(places[:, new], sigma[new], year)
-    return stars
-
-
-def _pair(master, tree, known, places, sigma, year, tolerance, slack):
-    """Return the star nearest to each row, one to one, or -1."""
-    bound = tolerance.between(master, known, sigma.max(), year, slack).max()
-    distance, near = tree.query(places.T, k=2, distance_upper_bound=bound)
-    near = np.append(known, -1)[near]
-    first, second = near.T
-    limit = tolerance.between(master, first, sigma, year, slack)
-    limit2 = tolerance.between(master, second, sigma, year, slack)
-    inside = (first >= 0) & (distance[:, 0] <= limit)
-    doubt = inside & (second >= 0) & (distance[:, 1] <= limit2)
-    stars = np.where(inside, first, -1)
-    # Nearest first: of several rows that claim one star, one may have it.
-    rows = np.flatnonzero(inside)
-    rows = rows[np.argsort(distance[rows, 0], kind='stable')]
-    claimed, winner, counts = np.unique(stars[rows], return_index=True,
-                                        return_counts=True)
-    stars[rows] = -1
-    stars[rows[winner]] = claimed
-    master.ambiguous[claimed[counts > 1]] = True
-    master.ambiguous[first[doubt]] = True
-    rows = np.flatnonzero(stars < 0)
-    taken = np.zeros(len(master.year), dtype=bool)
-    taken[claimed] = True
-    free = known[~taken[known]]
-    if len(rows) and len(free):
-        stars[rows] = _pair_left(master, free, places[:, rows], sigma[rows],
-                                 year, tolerance, slack)
-        master.ambiguous[stars[rows][stars[rows] >= 0]] = True
-    return stars
-
-
-def _pair_left(master, free, places, sigma, year, tolerance, slack):
-    """
-    Return for rows that are left the star that is left for them, or -1.
-
-    A fast star is not the one nearest to where it was; but it is paired only
-    where no other row and no other star is within the tolerance.
-    """
-    bound = tolerance.between(master, free, sigma.max(), year, slack).max()
-    tree = cKDTree(master.at(year)[:, free].T)
-    distance, near = tree.query(places.T, k=2, distance_upper_bound=bound)
-    star = np.append(free, -1)[near]
-    inside = [(star[:, k] >= 0) & (distance[:, k] <= tolerance.between(
-        master, star[:, k], sigma, year, slack)) for k in range(2)]
-    found = np.where(inside[0] & ~inside[1], star[:, 0], -1)
-    wanted, counts = np.unique(star[:, 0][inside[0]], return_counts=True)
-    return np.where(np.isin(found, wanted[counts == 1]), found, -1)
-
-
-def _tie(tree, places, tolerance):
-    """
-    Shift and stretch an exposure onto the known stars.
-
-    Returns the moved positions and the residual of the tie, the part of the
-    tolerance that errors do not explain.
-    """
-    if tolerance.radius is not None and tolerance.pointing == 0:
-        return places, 0.0
-    sample = places[:, _sample(places.shape[1])]
-    shift = _vote(tree, sample, tolerance.pointing)
-    reach = tolerance.pointing / 20
-    moved = places + shift[:, None]
-    matrix, rms = _affine_tie(tree, sample + shift[:, None], reach)
-    moved = matrix[:, :1] + matrix[:, 1:] @ moved
-    return moved, 3 * rms
-
-
-def _sample(n):
-    # A fixed seed: which stars tie the frames must not change the matches.
-    if n <= SAMPLE:
-        return slice(None)
-    return np.random.default_rng(0).choice(n, SAMPLE, replace=False)
-
-
-def _vote(tree, places, reach):
-    """Return the shift most pairs within ``reach`` agree on."""
-    if reach == 0:
-        return np.zeros(2)
-    neighbours = tree.query_ball_point(places.T[:2000], reach)
-    counts = [len(found) for found in neighbours]
-    if not sum(counts):
-        return np.zeros(2)
-    rows = np.repeat(np.arange(len(counts)), counts)
-    found = np.concatenate(neighbours).astype(int)
-    shifts = tree.data[found].T - places[:, rows]
-    width = reach / 20
-    votes, edges, _ = np.histogram2d(*shifts, bins=40,
-                                     range=[[-reach, reach]] * 2)
-    # Pairs on the edge of a cell count in the sum over its neighbours.
-    summed = sum(np.roll(votes, (i, j), axis=(0, 1))
-                 for i in (-1, 0, 1) for j in (-1, 0, 1))
-    cell = np.unravel_index(summed.argmax(), summed.shape)
-    centre = np.array([edges[k] + width / 2 for k in cell])
-    near = np.abs(shifts - centre[:, None]).max(axis=0) < 1.5 * width
-    return np.median(shifts[:, near], axis=1)
-
-
-def _affine_tie(tree, places, reach):
-    """Fit an affine map to the stars' nearest neighbours, robustly."""
-    matrix = np.array([[0.0, 1, 0], [0, 0, 1]])
-    scale = max(np.ptp(places), 1e-300)
-    design = np.vstack([np.ones(places.shape[1]), places / scale])
-    rms = reach / 3
-    for _ in range(5):
-        moved = matrix[:, :1] + matrix[:, 1:] @ places
-        distance, near = tree.query(moved.T,
-                                    distance_upper_bound=max(reach, 1e-300))
-        good = np.isfinite(distance)
-        if good.sum() < 12:
-            # Too few to tell a stretch from motions: the shift has to do.
-            return matrix, rms
-        target = tree.data[near[good]].T
-        fit = np.linalg.lstsq(design[:, good].T, target.T, rcond=None)[0].T
-        matrix = fit / np.array([1, scale, scale])
-        residual = target - fit @ design[:, good]
-        rms = std_about_zero(np.hypot(*residual)) / np.sqrt(2)
-        reach = min(reach, max(6 * rms, reach / 4))
-    return matrix, rms
-
-
 @dataclass(frozen=True)
 class HowToMatch:
     """How epochs are matched; see `ProperMotionFitter`."""
@@ -351,7 +71,7 @@ class HowToMatch:
                          pointing)
 
 
-def match_epochs(detections, on_sky, catalogue, how, unit):
+def match_epochs(detections, on_sky, catalogue, how, unit, orient):
     """
     Match epochs by identifier or position, as their user wants it.
 
@@ -364,6 +84,9 @@ def match_epochs(detections, on_sky, catalogue, how, unit):
         Reference objects, matched along by position.
     how : `HowToMatch`
     unit : {'mas', 'pix'}
+    orient : callable
+        Returns the maps onto the common plane of epochs without a sky, by
+        the pattern of their stars, and sentences on them.
 
     Returns
     -------
@@ -374,19 +97,17 @@ def match_epochs(detections, on_sky, catalogue, how, unit):
     known : (k,) int `~numpy.ndarray` or None
         The star of each object of the catalogue, -1 where it is in no
         epoch; None where it has no positions or is not matched by them.
+    notes : tuple of str
+        How epochs without a sky were found to be turned.
     """
     if _is_by_id(detections, on_sky, how, unit):
         matches, names = match_ids([one.ids for one in detections])
-        known = None
-    else:
-        matches, names, known = _match_on_plane(detections, catalogue,
-                                                how.tolerance(unit))
-    every = _stack(matches, names, detections)
-    if not (every.found.sum(axis=0) > 1).any():
-        msg = ('epochs must have stars in common, got none that is in two '
-               'of them')
-        raise ValueError(msg)
-    return every, matches, known
+        return _stack(matches, names, detections), matches, None, ()
+    known = _known_places(detections, catalogue)
+    matches, notes = _match_on_plane(detections, on_sky, known, how, unit,
+                                     orient)
+    matches, names, known = _named(matches, detections, catalogue, known)
+    return _stack(matches, names, detections), matches, known, notes
 
 
 def _stack(matches, names, detections):
@@ -464,26 +185,76 @@ def _without_offsets(places):
     return places
 
 
-def _match_on_plane(detections, catalogue, tolerance):
-    """
-    Return matches by position, names, and the stars of the catalogue.
+def _known_places(detections, catalogue):
+    """Return the `Known` stars, None for a catalogue without positions."""
+    if catalogue is None or not np.isfinite(catalogue.values[:2]).any():
+        return None
+    return _known(catalogue, float(np.nanmean(detections[0].years)))
 
-    The last is None for a catalogue without positions; its objects that no
-    epoch has seen are not among the stars.
+
+def _match_on_plane(detections, on_sky, known, how, unit, orient):
     """
+    Return matches by position, and sentences on what that took.
+
+    Planes without a sky may be turned, and are if it makes more matches.
+    """
+    tolerance = how.tolerance(unit)
+    if how.by == 'pattern' and not on_sky:
+        maps, notes = orient()
+        return _match_turned(detections, known, tolerance, maps), notes
+    matches = _match_turned(detections, known, tolerance,
+                            [None] * len(detections))
+    if on_sky or not _are_few(matches, known):
+        return matches, ()
+    try:
+        maps, notes = orient()
+    except ValueError:  # No pattern: they stay as they are, and that is said.
+        return matches, ()
+    turned = _match_turned(detections, known, tolerance, maps)
+    if _common(turned, known).sum() <= _common(matches, known).sum():
+        return matches, ()
+    return turned, notes
+
+
+def _common(matches, known):
+    """Return how many stars (E,) of each epoch are known from elsewhere."""
+    seen = matches.seen
+    count = seen.sum(axis=0)
+    if known is not None:
+        count[:known.position.shape[1]] += 1
+    return (seen & (count > 1)).sum(axis=1)
+
+
+def _are_few(matches, known):
+    """Return whether most stars of some epoch are nowhere else."""
+    return (_common(matches, known) < COMMON * matches.seen.sum(axis=1)).any()
+
+
+def _match_turned(detections, known, tolerance, maps):
+    """Return matches by position of planes that maps bring together."""
     years = [float(np.nanmean(one.years)) for one in detections]
-    sigmas = []
-    for one in detections:
-        with np.errstate(invalid='ignore'):
-            sigmas.append(np.sqrt((one.covariance[0]
-                                   + one.covariance[2]) / 2))
-    known = None
-    if catalogue is not None and np.isfinite(catalogue.values[:2]).any():
-        known = (catalogue.values[:2], catalogue.motion(),
-                 np.nan_to_num(catalogue.year, nan=years[0]))
-    matches = match_positions([one.plane for one in detections], sigmas,
-                              years, tolerance, known)
-    n_known = 0 if known is None else known[0].shape[1]
+    places, sigmas, reach = [], [], 0.0
+    for one, found in zip(detections, maps, strict=True):
+        sigma = np.sqrt(variance_2x2(one.covariance))
+        if found is not None:
+            sigma *= np.sqrt(abs(np.linalg.det(found.matrix[:, 1:])))
+            reach = max(reach, found.reach)
+        places.append(one.plane if found is None else found.apply(one.plane))
+        sigmas.append(sigma)
+    if reach and tolerance.radius is None and tolerance.max_motion == 0:
+        # Pixels, whose motions nobody knows a limit of.
+        tolerance = replace(tolerance, radius=reach)
+    return match_positions(places, sigmas, years, tolerance, known)
+
+
+def _named(matches, detections, catalogue, known):
+    """
+    Return the matches of stars in some epoch, their names, and which is which.
+
+    The last are the stars (k,) that the objects of the catalogue are, None
+    for one without positions.
+    """
+    n_known = 0 if known is None else known.position.shape[1]
     seen = matches.seen.any(axis=0)
     number = np.where(seen, np.cumsum(seen) - 1, -1)
     matches = Matches(matches.rows[:, seen], matches.ambiguous[seen])
@@ -493,6 +264,17 @@ def _match_on_plane(detections, catalogue, tolerance):
         names = _names_of_catalogue(catalogue.ids[seen[:n_known]],
                                     matches.rows.shape[1])
     return matches, names, None if known is None else number[:n_known]
+
+
+def _known(catalogue, year):
+    """Return the `Known` stars of a catalogue, at ``year`` if not dated."""
+    variance = np.einsum('kkn->kn', catalogue.covariance)
+    # An error that nobody knows is none, as it is for detections.
+    sigma, drift = (np.sqrt(np.where(some < NO_ERROR, some, 0.0).mean(axis=0))
+                    for some in (variance[:2], variance[2:4]))
+    return Known(catalogue.values[:2], catalogue.motion(),
+                 np.nan_to_num(catalogue.year, nan=year), sigma,
+                 np.where(catalogue.fixed, 0.0, drift))
 
 
 def _names_of_catalogue(ids, n):
@@ -532,9 +314,8 @@ def find_references(catalogue, detections, years, tolerance):
     found = np.full(len(catalogue.kinds), -1)
     for e, year in enumerate(years):
         # Epoch by epoch: frames that differ would blur a star's mean place.
-        known = (catalogue.values[:2], catalogue.motion(),
-                 np.nan_to_num(catalogue.year, nan=year))
-        sigma = np.sqrt(detections.covariance[[0, 2], e].mean(axis=0))
+        known = _known(catalogue, year)
+        sigma = np.sqrt(variance_2x2(detections.covariance[:, e]))
         matches = match_positions([detections.plane[:, e]], [sigma], [year],
                                   tolerance, known)
         stars = matches.rows[0, :len(found)]

@@ -11,7 +11,9 @@ from photutils_mgauss.motions.priors import (
     add_parallax_prior,
     build_priors,
 )
+from photutils_mgauss.motions.stacked import variance_2x2
 from photutils_mgauss.sky.transforms import Transform
+from photutils_mgauss.utils.validation import as_rng
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,9 @@ class Setup:
         Years since then.
     priors : `~photutils_mgauss.motions.priors.Priors`
         Those of all references in use.
+    places : `~photutils_mgauss.motions.priors.Priors`
+        What references are left with that are held out or rejected: their
+        places, where the epochs alone make no motion, else nothing.
     anchors : (n,) bool `~numpy.ndarray`
         Stars that say where the frames are: the references of known motion,
         or without any all stars.
@@ -85,6 +90,7 @@ class Setup:
     working_year: float
     dt: np.ndarray
     priors: Priors
+    places: Priors
     anchors: np.ndarray
     held: np.ndarray
     relative: bool
@@ -120,7 +126,7 @@ class State:
 
 def prepare(sightings, options):
     """Return the `Setup` of a fit, and the `State` it starts from."""
-    _check_parallax(options, sightings)
+    _check_options(options, sightings)
     floor = _first_floor(options.systematic, sightings)
     stars, catalogue = sightings.references, sightings.catalogue
     held = _hold_out(stars, options)
@@ -129,6 +135,7 @@ def prepare(sightings, options):
     anchors[held] = False
     relative = not anchors.any()
     if relative:
+        _check_single(sightings, options)
         anchors[:] = True
     working = float(np.nanmean(sightings.epoch_years))
     dt = np.nan_to_num(sightings.years - working)
@@ -137,17 +144,14 @@ def prepare(sightings, options):
     origin, transform = _field(sightings, options.transform, ~untied)
     drift = _drift(sightings, origin, options)
     nearing, notes = _nearing(sightings, options)
-    use = ~np.isin(stars, held)
-    priors = build_priors(catalogue.select(use), stars[use],
-                          origin[:, stars[use]], working, sightings.unit,
-                          options.n_star_parameters)
+    priors, places = _priors(sightings, held, origin, working, options)
     if options.parallax == 'prior':
         priors = add_parallax_prior(priors, len(anchors),
                                     options.parallax_prior)
-    variance = sightings.covariance[0][sightings.usable]
+    variance = variance_2x2(sightings.covariance[:, sightings.usable])
     maps = np.repeat(transform.identity()[None], len(dt), axis=0)
     return (Setup(sightings, options, transform, origin, working, dt, priors,
-                  anchors, held, relative, drift, nearing, notes,
+                  places, anchors, held, relative, drift, nearing, notes,
                   np.median(variance) if variance.size else 1.0),
             State(maps, sightings.usable.copy(), floor,
                   np.empty(0, dtype=int), untied,
@@ -155,7 +159,11 @@ def prepare(sightings, options):
                   np.zeros(len(anchors), dtype=bool)))
 
 
-def _check_parallax(options, sightings):
+def _check_options(options, sightings):
+    if options.recipe == 'paper' and sightings.single:
+        msg = ("recipe must be 'joint' or 'two-step' for epochs of one time "
+               "and a catalogue, got 'paper'")
+        raise ValueError(msg)
     if options.parallax and options.recipe == 'paper':
         msg = ("parallax must be False for the recipe 'paper', got "
                f'{options.parallax!r}')
@@ -164,6 +172,32 @@ def _check_parallax(options, sightings):
         msg = ('parallax must be False for epochs without a place in the '
                f'sky, got {options.parallax!r}')
         raise ValueError(msg)
+
+
+def _check_single(sightings, options):
+    """Raise where maps would take up all motions there are."""
+    if sightings.single and options.transform.kind != 'none':
+        msg = ('references must have objects of known motion (class '
+               "'star', 'qso' or 'galaxy') among the stars for epochs of "
+               'one time, got none; or give the catalogue as another Epoch '
+               'for motions relative to the mean of the stars')
+        raise ValueError(msg)
+
+
+def _priors(sightings, held, origin, working, options):
+    """Return the `Priors` of references in use, and of places alone."""
+    stars, catalogue = sightings.references, sightings.catalogue
+
+    def build(some, which):
+        return build_priors(some.select(which), stars[which],
+                            origin[:, stars[which]], working,
+                            sightings.unit, options.n_star_parameters)
+    use = ~np.isin(stars, held)
+    priors = build(catalogue, use)
+    if not sightings.single:
+        return priors, Priors.none(options.n_star_parameters)
+    places = build(catalogue.places(), np.ones(len(stars), dtype=bool))
+    return priors.with_others(places.of(held)), places
 
 
 def _first_floor(systematic, sightings):
@@ -182,7 +216,7 @@ def _hold_out(stars, options):
     n = round(options.hold_out * len(stars))
     if n == 0:
         return np.empty(0, dtype=int)
-    rng = np.random.default_rng(options.rng)
+    rng = as_rng(options.rng)
     return np.sort(rng.choice(stars, n, replace=False))
 
 
@@ -201,7 +235,7 @@ def _scattered(sightings, anchors, max_motion):
     typical = spread[anchors & (count > 1)]
     limit = 30 * np.median(typical) if len(typical) else 0.0
     if sightings.unit == 'mas':
-        baseline = np.ptp(sightings.epoch_years) * u.yr
+        baseline = sightings.baseline * u.yr
         limit = max(limit, (max_motion * baseline).to_value(u.mas))
     return (spread > limit) | ~sightings.ties.agreed
 

@@ -70,6 +70,19 @@ class Priors:
         """Return the priors of all stars but these."""
         return self.pick(~np.isin(self.stars, stars))
 
+    def of(self, stars):
+        """Return the priors of these stars alone, as far as there are any."""
+        return self.pick(np.isin(self.stars, stars))
+
+    def with_others(self, other):
+        """Return these priors and those of other stars."""
+        order = np.argsort(np.concatenate([self.stars, other.stars]))
+        return Priors(*(np.concatenate(pair, axis=-1)[..., order]
+                        for pair in ((self.stars, other.stars),
+                                     (self.precision, other.precision),
+                                     (self.moment, other.moment),
+                                     (self.constant, other.constant))))
+
 
 def build_priors(catalogue, stars, origin, year, unit, n_parameters):
     """
@@ -121,6 +134,14 @@ def _known(catalogue, i, origin, year, zero, size):
     known = np.flatnonzero(known[:size])
     return (matrix[known, :size], covariance[np.ix_(known, known)],
             value[known])
+
+
+def weak_priors(n_stars, n_parameters, sigma):
+    """Return `Priors` that know next to nothing: all is 0 +- ``sigma``."""
+    precision = np.repeat(np.eye(n_parameters)[..., None] / sigma**2,
+                          n_stars, axis=2)
+    return Priors(np.arange(n_stars), precision,
+                  np.zeros((n_parameters, n_stars)), np.zeros(n_stars))
 
 
 def add_parallax_prior(priors, n_stars, parallax):

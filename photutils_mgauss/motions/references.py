@@ -70,6 +70,10 @@ class Catalogue:
             year)
         return replace(self, values=values, covariance=covariance, year=years)
 
+    def places(self):
+        """Return the objects as positions whose motions are not known."""
+        return replace(self, kinds=np.full(len(self.kinds), 'position'))
+
     def select(self, which):
         """Return some of the objects, without their identifiers."""
         return replace(

@@ -46,8 +46,8 @@ def decode_motion_flags(flags):
     >>> decode_motion_flags(8)
     ['outlier: a detection was rejected as an outlier']
     """
-    return [sentence for bit, sentence in FLAGS.items()
-            if int(flags) & bit]
+    flags = as_integer(flags, 'flags', minimum=0)
+    return [sentence for bit, sentence in FLAGS.items() if flags & bit]
 
 
 def solution_of(result, ref_epoch=None):

@@ -116,6 +116,18 @@ def dimensions_2x2(covariance):
     return np.where(thin, 1, 2)
 
 
+def variance_2x2(covariance):
+    """
+    Return the mean variance of both axes of covariances (3, ...).
+
+    Of those of a single direction, the variance in that direction.
+    """
+    xx, xy, yy = covariance
+    with np.errstate(invalid='ignore', divide='ignore'):
+        return np.where(dimensions_2x2(covariance) == 1,
+                        (xx * yy - xy * xy) / (xx + yy), (xx + yy) / 2)
+
+
 class Summed:
     """A dataclass of arrays, of which two are added field by field."""
 

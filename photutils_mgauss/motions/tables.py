@@ -3,6 +3,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import MaskedColumn, QTable
 
+from photutils_mgauss.motions.baseline import period
 from photutils_mgauss.motions.joint import solve_all
 from photutils_mgauss.motions.loop import measured
 from photutils_mgauss.motions.propagation import FROM_OURS
@@ -40,16 +41,18 @@ GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
 STRONG = 0.3
 
 
-def visibility_periods(years, used):
+def visibility_periods(sightings, used):
     """
     Return the number of groups of detections (n,), far apart in time.
 
-    Groups are 4 days apart (as Gaia counts them), or 1 per cent of the
-    whole baseline where that is shorter.
+    ``used`` (E, n) are those of the `Sightings` that count.
     """
+    return groups_in_time(sightings.years, period(sightings.baseline), used)
+
+
+def groups_in_time(years, gap, used):
+    """Return the number of groups (n,), more than a gap [yr] apart."""
     order = np.argsort(np.nanmean(years, axis=1))
-    baseline = np.nanmax(years) - np.nanmin(years)
-    gap = min(4 / 365.25, baseline / 100)
     last = np.full(used.shape[1], -np.inf)
     count = np.zeros(used.shape[1], dtype=int)
     for e in order:
@@ -196,7 +199,7 @@ def _flags(fit):
     seen = sightings.matches.seen
     finite = np.isfinite(sightings.places).all(axis=0)
     solved = np.isfinite(fit.estimates.values).all(axis=0)
-    periods = visibility_periods(sightings.years, state.used)
+    periods = visibility_periods(sightings, state.used)
     solved &= (periods > 1) | ((fit.ranks > 1) & (periods > 0))
     stars = np.arange(len(solved))
     relative = fit.setup.relative and fit.setup.transform.kind != 'none'
@@ -221,7 +224,7 @@ def _add_quality(table, fit, solved):
     tested = solved & (dof > 0)
     table['n_obs'] = sightings.matches.seen.sum(axis=0)
     table['n_good_obs'] = used
-    table['visibility_periods_used'] = visibility_periods(sightings.years,
+    table['visibility_periods_used'] = visibility_periods(sightings,
                                                           state.used)
     table['chi2'] = np.where(tested, fit.chi2, np.nan)
     table['dof'] = np.where(tested, dof, np.nan)

@@ -80,6 +80,10 @@ def psf_arrays(model):
         them (M, K, 4), the axes of the grid, and whether they are integrated
         over pixels.
     """
+    if not isinstance(model, PSFModel):
+        msg = ('psf must be a MultiGaussianPSFModel, GriddedMixturePSF or '
+               f'MixtureField, got {type(model).__name__}')
+        raise TypeError(msg)
     grid = model.grid
     rows, x_grid, y_grid = (_as_kernels_take(a, np.float64)
                             for a in (grid.rows, grid.x_grid, grid.y_grid))

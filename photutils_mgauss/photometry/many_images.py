@@ -41,7 +41,7 @@ from photutils_mgauss.sky.wcs import (
     pixel_to_vectors,
 )
 from photutils_mgauss.utils.image import read_pixels
-from photutils_mgauss.utils.star_columns import column_values
+from photutils_mgauss.utils.star_columns import check_table, column_values
 from photutils_mgauss.utils.validation import as_shape
 
 __all__ = ['add_sky_positions', 'fit_many', 'to_flux_densities']
@@ -89,10 +89,7 @@ def add_sky_positions(table, wcs):
     (<Quantity [3.6] mas>, <Quantity [7.2] mas>)
     """
     check_celestial(wcs)
-    missing = {'x_fit', 'y_fit', 'x_err', 'y_err'} - set(table.colnames)
-    if missing:
-        msg = f'table must have the column {min(missing)}, got none'
-        raise ValueError(msg)
+    check_table(table, 'table', ('x_err', 'x_fit', 'y_err', 'y_fit'))
     x, y = (column_values(table, name, u.pix) for name in ('x_fit', 'y_fit'))
     vectors = pixel_to_vectors(wcs, x, y)
     covariance = np.zeros((len(table), 2, 2))
@@ -155,10 +152,7 @@ def to_flux_densities(table, *, pixel_area=None, wcs=None, magnitudes=False):
     >>> stars['mag_ab'].round(3), stars['mag_ab_err'].round(3)
     (<Quantity [22.497] mag>, <Quantity [0.011] mag>)
     """
-    missing = {'flux_fit', 'flux_err'} - set(table.colnames)
-    if missing:
-        msg = f'table must have the column {min(missing)}, got none'
-        raise ValueError(msg)
+    check_table(table, 'table', ('flux_err', 'flux_fit'))
     out = table.copy()
     unit = getattr(table['flux_fit'], 'unit', None) or u.one
     if unit.is_equivalent(u.Jy):

@@ -31,9 +31,17 @@ from photutils_mgauss.utils.image import (
     read_values,
     with_unit,
 )
-from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
+from photutils_mgauss.utils.validation import (
+    as_columns,
+    as_floats,
+    as_real,
+    as_shape,
+)
 
 __all__ = ['CramerRao', 'cramer_rao', 'pixel_error']
+
+# Pixels are counted with 32 bits.
+_FARTHEST = 1e9
 
 
 def _electrons(gain, exposure_time):
@@ -117,6 +125,10 @@ def pixel_error(light, *, sky=0, read_noise=0, gain=1, exposure_time=None):
     sky = read_values(sky, 'sky', unit)
     background = background_error(sky=sky, read_noise=read_noise, gain=gain,
                                   exposure_time=exposure_time)
+    if np.shape(background) not in ((), light.shape):
+        msg = (f'sky must be a number or have the shape {light.shape} of '
+               f'light, got {np.shape(background)}')
+        raise ValueError(msg)
     background = np.broadcast_to(background, light.shape)
     return with_unit(calc_total_error(light, background,
                                       _electrons(gain, exposure_time)), unit)
@@ -217,8 +229,10 @@ def cramer_rao(psf, flux, sky=0, *, x=0, y=0, read_noise=0, gain=1,
     array([0.01 , 0.001])
     """
     flux, unit = read_quantity(flux, 'flux')
-    flux, x, y = (np.atleast_1d(a).astype(float) for a in np.broadcast_arrays(
-        as_floats(flux, 'flux'), as_floats(x, 'x'), as_floats(y, 'y')))
+    flux, x, y = as_columns(flux=flux, x=x, y=y)
+    if not flux.size:
+        msg = 'flux, x and y must hold at least one star, got none'
+        raise ValueError(msg)
     sky = as_real(read_level(sky, 'sky', unit), 'sky', minimum=0)
     level = background_error(sky=sky,
                              read_noise=read_noise, gain=gain,
@@ -236,6 +250,11 @@ class _StarDerivatives:
     """The PSF and its derivatives by position in the pixels of each star."""
 
     def __init__(self, psf, x, y, fit_shape):
+        far = np.abs([x, y]) > _FARTHEST
+        if far.any():
+            msg = (f'x and y must be within {_FARTHEST:g} pixels of the '
+                   f'origin, got {np.array([x, y])[far][0]:g}')
+            raise ValueError(msg)
         self.x, self.y = x, y
         self.psf = _kernel_arrays(psf)
         huge = (np.iinfo(np.int32).max, np.iinfo(np.int32).max)
@@ -300,8 +319,11 @@ def _joint_bound(stars, flux, noise, free_sky):
 def _inverse_blocks(fisher, n):
     """Return the first n diagonal (3, 3) blocks of the inverse matrix."""
     scale = np.sqrt(np.diag(fisher))
-    scale = np.where(scale > 0, scale, 1)
-    inverse = np.linalg.inv(fisher / np.outer(scale, scale))
-    inverse /= np.outer(scale, scale)
+    # The position of a star without flux is not bound by the data.
+    known = scale > 0
+    inverse = np.diag(np.where(known, 0, np.inf))
+    scale = np.outer(scale[known], scale[known])
+    inverse[np.ix_(known, known)] = np.linalg.inv(
+        fisher[np.ix_(known, known)] / scale) / scale
     return np.array([inverse[3 * i:3 * i + 3, 3 * i:3 * i + 3]
                      for i in range(n)])

@@ -3,10 +3,8 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
-from photutils_mgauss.motions.tables import (
-    add_parameters,
-    visibility_periods,
-)
+from photutils_mgauss.motions.baseline import period
+from photutils_mgauss.motions.tables import add_parameters, groups_in_time
 from photutils_mgauss.pixel_motions.campaign import light_unit
 from photutils_mgauss.sky.space_motion import turned
 from photutils_mgauss.utils.star_columns import words_column
@@ -77,8 +75,9 @@ def _add_quality(table, campaign, solved, seen):
     chi2, dof = chi2_of(campaign, solved)
     table['n_obs'] = seen.sum(axis=1)
     table['n_good_obs'] = seen.sum(axis=1)
-    table['visibility_periods_used'] = visibility_periods(
-        campaign.years[:, None], seen.T)
+    gap = period(np.ptp(campaign.years))
+    table['visibility_periods_used'] = groups_in_time(
+        campaign.years[:, None], gap, seen.T)
     table['chi2'], table['dof'] = chi2, dof
     with np.errstate(divide='ignore', invalid='ignore'):
         table['reduced_chi2'] = chi2 / dof

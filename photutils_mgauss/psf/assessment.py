@@ -18,7 +18,7 @@ from astropy.table import QTable
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.equality import ComparedByValue
-from photutils_mgauss.utils.validation import as_shape
+from photutils_mgauss.utils.validation import as_choice, as_shape
 
 __all__ = ['PSFAssessment', 'assess_psf']
 
@@ -66,6 +66,10 @@ class PSFAssessment(ComparedByValue):
                 f'{self.median("ellipticity_error"):+.4f} +- '
                 f'{self.scatter("ellipticity_error"):.4f}>')
 
+    def _column(self, name):
+        as_choice(name, 'name', self.table.colnames)
+        return np.asarray(self.table[name])
+
     def map(self, name):
         """
         Return a column of the table as a map.
@@ -78,8 +82,13 @@ class PSFAssessment(ComparedByValue):
         Returns
         -------
         (ny, nx) `~numpy.ndarray`
+
+        Raises
+        ------
+        ValueError
+            If the table has no such column.
         """
-        return np.asarray(self.table[name]).reshape(self.grid_shape)
+        return self._column(name).reshape(self.grid_shape)
 
     def median(self, name):
         """
@@ -94,7 +103,7 @@ class PSFAssessment(ComparedByValue):
         -------
         float
         """
-        return float(np.nanmedian(self.table[name]))
+        return float(np.nanmedian(self._column(name)))
 
     def scatter(self, name):
         """
@@ -109,7 +118,7 @@ class PSFAssessment(ComparedByValue):
         -------
         float
         """
-        return float(np.nanstd(self.table[name]))
+        return float(np.nanstd(self._column(name)))
 
 
 def assess_psf(model, truth, grid=(30, 30), *, shape=None, oversampling=1,

@@ -12,6 +12,7 @@ from astropy.units import (
 )
 
 from photutils_mgauss.utils import compat
+from photutils_mgauss.utils.validation import real_array
 
 # How files hold the parameters of a model: the columns and their units.
 PARAMETER_COLUMNS = dict.fromkeys(
@@ -282,8 +283,8 @@ def plain_positions(x, y, x_0, y_0):
 def split_flux(flux):
     """Return the flux as a plain float array and its unit or None."""
     if isinstance(flux, Quantity):
-        return np.asarray(flux.value, float), flux.unit
-    return np.asarray(flux, float), None
+        return real_array(flux.value, 'flux'), flux.unit
+    return real_array(flux, 'flux'), None
 
 
 def with_unit(values, unit):
@@ -298,7 +299,7 @@ def flat_points(*arrays):
     Arrays of one element stay one element long: kernels treat them as
     numbers.
     """
-    arrays = [np.asarray(a, dtype=float) for a in arrays]
+    arrays = [real_array(a, 'positions and fluxes') for a in arrays]
     shape = arrays[0].shape
     if shape == arrays[1].shape and all(
             a.size == 1 and a.ndim <= len(shape) for a in arrays[2:]):

@@ -28,7 +28,12 @@ from photutils_mgauss.psf.convert import GridConversions
 from photutils_mgauss.psf.grid import checked_arrays, make_grid, plain_report
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.model import MultiGaussianPSFModel
-from photutils_mgauss.utils.validation import as_choice, as_floats, as_shape
+from photutils_mgauss.utils.validation import (
+    as_choice,
+    as_columns,
+    as_shape,
+    real_array,
+)
 
 __all__ = ['GriddedMixturePSF']
 
@@ -235,7 +240,8 @@ n_components=1)>
         """
         x, y, x_0, y_0 = plain_positions(x, y, x_0, y_0)
         flux, unit = split_flux(flux)
-        if np.shape(x_0) != np.shape(y_0):
+        x_0, y_0 = real_array(x_0, 'x_0'), real_array(y_0, 'y_0')
+        if x_0.shape != y_0.shape:
             x_0, y_0 = np.broadcast_arrays(x_0, y_0)
         (x, y, flux, x_0, y_0), shape = flat_points(x, y, flux, x_0, y_0)
         out = np.empty(x.size)
@@ -418,9 +424,7 @@ n_components=1)>
         >>> psf.render([3.2, 8.1], [4, 5], 100, 11).sum(axis=(1, 2))
         array([99.99999732, 99.99999832])
         """
-        stars = np.broadcast_arrays(*(as_floats(value, name) for value, name
-                                      in ((x, 'x'), (y, 'y'), (flux, 'flux'))))
-        x, y, flux = (np.array(a, ndmin=1) for a in stars)
+        x, y, flux = as_columns(x=x, y=y, flux=flux)
         ny, nx = as_shape(shape, 'shape')
         out = np.zeros((x.size, ny, nx))
         self._run(2, x, y, flux, np.rint(x) - (nx - 1) // 2,

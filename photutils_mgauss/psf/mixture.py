@@ -21,6 +21,7 @@ from photutils_mgauss.utils.validation import (
     as_real,
     as_shape,
     in_pixels,
+    real_array,
 )
 
 __all__ = ['GaussianMixture', 'Moments', 'blend']
@@ -154,8 +155,9 @@ class GaussianMixture(ComparedByValue):
                [1., 4.]])
         """
         stddevs = as_floats(stddevs, 'stddevs', shape=(None, 2))
-        rho = as_floats(np.full(len(stddevs), rho) if np.ndim(rho) == 0
-                        else rho, 'rho', shape=(len(stddevs),))
+        rho = as_floats(rho, 'rho', finite=False)
+        rho = as_floats(np.full(len(stddevs), rho) if rho.ndim == 0 else rho,
+                        'rho', shape=(len(stddevs),))
         if not (stddevs > 0).all():
             msg = f'stddevs must be positive, got {stddevs.min()}'
             raise ValueError(msg)
@@ -530,6 +532,10 @@ def blend(mixtures, fractions):
     array([0.75, 0.25])
     """
     mixtures = list(mixtures)
+    for mixture in mixtures:
+        if not isinstance(mixture, GaussianMixture):
+            msg = f'mixtures must be GaussianMixtures, got {mixture!r:.80}'
+            raise TypeError(msg)
     fractions = as_floats(fractions, 'fractions', shape=(len(mixtures),))
     # Only weights change: averaging shapes would pair components whose order
     # is arbitrary.
@@ -541,8 +547,8 @@ def blend(mixtures, fractions):
 
 def _points(x, y):
     """Return flat float64 positions and the shape they broadcast to."""
-    x, y = np.broadcast_arrays(np.asarray(in_pixels(x, 'x'), float),
-                               np.asarray(in_pixels(y, 'y'), float))
+    x, y = np.broadcast_arrays(*(real_array(in_pixels(value, name), name)
+                                 for value, name in ((x, 'x'), (y, 'y'))))
     return x.ravel(), y.ravel(), x.shape
 
 

@@ -10,9 +10,10 @@ from astropy.table import QTable
 
 from photutils_mgauss.simulation.exposures import NGP
 from photutils_mgauss.utils.validation import (
-    as_floats,
     as_integer,
+    as_range,
     as_real,
+    as_rng,
     as_shape,
 )
 
@@ -69,10 +70,9 @@ def sparse_field(shape, *, spacing=46, psf_fraction=0.28,
     shape = as_shape(shape, 'shape')
     spacing = as_integer(spacing, 'spacing', minimum=4, maximum=min(shape))
     fraction = as_real(psf_fraction, 'psf_fraction', minimum=0, maximum=1)
-    ranges = [as_floats(value, name, shape=(2,)) for value, name in
-              ((magnitudes, 'magnitudes'),
-               (psf_magnitudes, 'psf_magnitudes'))]
-    rng = np.random.default_rng(rng)
+    ranges = [as_range(magnitudes, 'magnitudes'),
+              as_range(psf_magnitudes, 'psf_magnitudes')]
+    rng = as_rng(rng)
     y, x = (grid.ravel() for grid in
             np.meshgrid(*(_cells(n, spacing) for n in shape), indexing='ij'))
     shifts = rng.uniform(-spacing / 4, spacing / 4, (2, x.size))
@@ -141,9 +141,10 @@ def crowded_field(shape, *, density=PAPER_DENSITY, magnitudes=(16.0, 26.0),
     ny, nx = as_shape(shape, 'shape')
     margin = as_real(margin, 'margin', minimum=0)
     density = as_real(density, 'density', minimum=0)
-    limits = as_floats(magnitudes, 'magnitudes', shape=(2,))
-    rng = np.random.default_rng(rng)
-    n = rng.poisson(density * (ny + 2 * margin) * (nx + 2 * margin))
+    limits = as_range(magnitudes, 'magnitudes')
+    rng = as_rng(rng)
+    expected = density * (ny + 2 * margin) * (nx + 2 * margin)
+    n = rng.poisson(as_real(expected, 'density times the area', maximum=1e9))
     low, high = -margin - 0.5, margin - 0.5
     x = rng.uniform(low, nx + high, n)
     y = rng.uniform(low, ny + high, n)
@@ -217,7 +218,7 @@ def sky_field(n_stars=614, n_qsos=590, *, ra=NGP[0], dec=NGP[1], size=11.3,
     n_stars = as_integer(n_stars, 'n_stars', minimum=0)
     n_qsos = as_integer(n_qsos, 'n_qsos', minimum=0)
     size = as_real(size, 'size', above=0) * 60
-    rng = np.random.default_rng(rng)
+    rng = as_rng(rng)
     n = n_stars + n_qsos
     is_qso = np.arange(n) >= n_stars
     plane = _apart(n, size, as_real(separation, 'separation', minimum=0), rng)
@@ -279,7 +280,7 @@ def _magnitudes(is_qso, limits, rng):
     g = np.where(is_qso, 20 + 5.5 * rng.beta(2.2, 1.6, n),
                  18 + 8 * rng.beta(2.0, 1.4, n))
     if limits is not None:
-        g = rng.uniform(*as_floats(limits, 'magnitudes', shape=(2,)), n)
+        g = rng.uniform(*as_range(limits, 'magnitudes'), n)
     colours = np.array([_COLOURS['qso' if q else 'star'] for q in is_qso])
     colours = colours.reshape(-1, 3).T
     scatter = rng.standard_normal(n) * colours[2]

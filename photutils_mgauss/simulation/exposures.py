@@ -43,7 +43,7 @@ from photutils_mgauss.sky.tangent_plane import (
     local_axes,
     unit_vectors,
 )
-from photutils_mgauss.utils.validation import as_floats, as_real
+from photutils_mgauss.utils.validation import as_floats, as_real, as_rng
 
 _LIGHT_SPEED = 299792.458 * u.km / u.s
 _LIGHT_YEARS = (u.au / _LIGHT_SPEED).to_value(u.yr)  # in one au
@@ -441,7 +441,7 @@ def paper_exposures(ra=NGP[0], dec=NGP[1], *, offset=3.0, rotation=0.05,
     >>> [exposure.band.name for exposure in exposures]
     ['i', 'g', 'g', 'i', 'i', 'r', 'r']
     """
-    rng = np.random.default_rng(rng)
+    rng = as_rng(rng)
     bent = _CUBIC & (np.add(*np.indices((4, 4))) >= 2)
     exposures = []
     for time, detector, band in _TABLE_2:

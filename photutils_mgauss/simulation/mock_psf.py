@@ -9,8 +9,14 @@ import numpy as np
 
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
-from photutils_mgauss.simulation.instrument import CSST_BANDS
-from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
+from photutils_mgauss.simulation.instrument import CSST_BANDS, Band
+from photutils_mgauss.utils.validation import (
+    as_instance,
+    as_integer,
+    as_real,
+    as_rng,
+    as_shape,
+)
 
 # The PSF in g before the pixel: weights and standard deviations [pix].
 _WEIGHTS = np.array([0.60, 0.28, 0.09, 0.03])
@@ -65,7 +71,7 @@ def csst_psf(shape=(9232, 9216), band='g', *, n_nodes=5, variation=1.0,
     ny, nx = as_shape(shape, 'shape')
     n = as_integer(n_nodes, 'n_nodes', minimum=2)
     variation = as_real(variation, 'variation', minimum=0)
-    coefficients = _coefficients(np.random.default_rng(rng)) * variation
+    coefficients = _coefficients(as_rng(rng)) * variation
     width = _width(band_of(band))
     u, v = (a.ravel() for a in np.meshgrid(*[np.linspace(-1, 1, n)] * 2))
     changes = np.polynomial.polynomial.polyval2d(
@@ -79,7 +85,7 @@ def csst_psf(shape=(9232, 9216), band='g', *, n_nodes=5, variation=1.0,
 def band_of(band):
     """Return a band from itself or from the name of one of the CSST's."""
     if not isinstance(band, str):
-        return band
+        return as_instance(band, Band, 'band')
     if band not in CSST_BANDS:
         words = ', '.join(map(repr, CSST_BANDS))
         msg = f'band must be a Band or one of {words}, got {band!r}'

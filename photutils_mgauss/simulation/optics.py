@@ -15,7 +15,12 @@ from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss.simulation.instrument import Band
 from photutils_mgauss.simulation.mock_psf import band_of
-from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
+from photutils_mgauss.utils.validation import (
+    as_integer,
+    as_real,
+    as_rng,
+    as_shape,
+)
 
 __doctest_requires__ = {'Optics': ['galsim']}
 
@@ -91,7 +96,7 @@ class Optics:
     @cached_property
     def _coefficients(self):
         """The polynomials of the aberrations, (8, 4, 4) [nm]."""
-        rng = np.random.default_rng(self.rng)
+        rng = as_rng(self.rng)
         order = np.add(*np.indices((4, 4)))
         size = np.where(order == 0, self.wavefront,
                         self.variation / np.maximum(order, 1))

@@ -27,7 +27,14 @@ from photutils_mgauss.simulation.image import Chip, draw, expose, read
 from photutils_mgauss.simulation.instrument import Instrument
 from photutils_mgauss.simulation.mock_psf import csst_psf
 from photutils_mgauss.simulation.renderer import renderer_of, widen
-from photutils_mgauss.utils.validation import as_floats, as_real, as_shape
+from photutils_mgauss.utils.star_columns import check_table
+from photutils_mgauss.utils.validation import (
+    as_floats,
+    as_instance,
+    as_real,
+    as_rng,
+    as_shape,
+)
 
 __all__ = ['Scene', 'render_stars', 'simulate', 'simulate_catalogues',
            'simulate_epochs']
@@ -197,12 +204,14 @@ def simulate(sources, exposure=None, *, instrument=None, psf=None,
     >>> scene.image.shape
     (256, 256)
     """
-    rng = np.random.default_rng(rng)
-    exposure = Exposure() if exposure is None else exposure
-    instrument = Instrument() if instrument is None else instrument
+    rng = as_rng(rng)
+    exposure = (Exposure() if exposure is None
+                else as_instance(exposure, Exposure, 'exposure'))
+    instrument = _instrument(instrument)
     if psf is None:
         psf, = _each_psf(None, [exposure], instrument)
-    effects = DetectorEffects() if effects is None else effects
+    effects = (DetectorEffects() if effects is None
+               else as_instance(effects, DetectorEffects, 'effects'))
     psf = widen(psf, effects.charge_diffusion)
     wcs = exposure.wcs(instrument.shape, instrument.pixel_scale)
     truth = _truth(sources, exposure, instrument, wcs)
@@ -253,10 +262,11 @@ def simulate_epochs(sources, exposures, *, instrument=None, psfs=None,
     >>> [scene.time.isot[:10] for scene in scenes]
     ['2024-12-12', '2026-05-30', '2026-08-11']
     """
-    exposures = list(exposures)
-    instrument = Instrument() if instrument is None else instrument
+    exposures = [as_instance(exposure, Exposure, 'exposures')
+                 for exposure in exposures]
+    instrument = _instrument(instrument)
     psfs = _each_psf(psfs, exposures, instrument)
-    seeds = np.random.default_rng(rng).spawn(len(exposures))
+    seeds = as_rng(rng).spawn(len(exposures))
     return [simulate(sources, exposure, instrument=instrument, psf=psf,
                      effects=effects, rng=seed, executor=executor)
             for exposure, psf, seed in zip(exposures, psfs, seeds,
@@ -303,10 +313,12 @@ def simulate_catalogues(sources, exposures, *, instrument=None, psfs=None,
     >>> [len(catalogue.table) for catalogue in catalogues]
     [30, 30]
     """
-    exposures = list(exposures)
-    instrument = Instrument() if instrument is None else instrument
+    exposures = [as_instance(exposure, Exposure, 'exposures')
+                 for exposure in exposures]
+    instrument = _instrument(instrument)
     psfs = _each_psf(psfs, exposures, instrument)
-    seeds = np.random.default_rng(rng).spawn(len(exposures))
+    threshold = as_real(threshold, 'threshold', minimum=0)
+    seeds = as_rng(rng).spawn(len(exposures))
     return [_catalogue(sources, exposure, instrument, psf, threshold, seed,
                        executor)
             for exposure, psf, seed in zip(exposures, psfs, seeds,
@@ -328,6 +340,11 @@ def _catalogue(sources, exposure, instrument, psf, threshold, rng, executor):
     truth = truth[bright]
     return SimulatedCatalogue(draw_table(truth, bounds[bright], rng), truth,
                               wcs, exposure.time)
+
+
+def _instrument(instrument):
+    return (Instrument() if instrument is None
+            else as_instance(instrument, Instrument, 'instrument'))
 
 
 def _each_psf(psfs, exposures, instrument):
@@ -409,6 +426,7 @@ def _truth(sources, exposure, instrument, wcs):
 
 def _positions(sources, exposure, instrument):
     """Return x and y (n,) of sources that have pixels or sky positions."""
+    check_table(sources, 'sources')
     if 'x' in sources.colnames and 'y' in sources.colnames:
         return [as_floats(u.Quantity(sources[name], u.pix).value, name,
                           shape=(None,)) for name in ('x', 'y')]

@@ -35,15 +35,24 @@ class Correction:
     coefficients : (2, b) `~numpy.ndarray`
     velocity : (3,) `~numpy.ndarray` or None
         Velocity of the observer, whose aberration is removed first.
+    turn : (3, 3) `~numpy.ndarray` or None
+        A rotation of the sphere before everything else, whose axes the
+        velocity is in.
     """
 
     plane: TangentPlane
     transform: Transform
     coefficients: np.ndarray
     velocity: np.ndarray | None = None
+    turn: np.ndarray | None = None
+
+    def turned(self, vectors):
+        """Return directions (3, n) after the rotation alone."""
+        return vectors if self.turn is None else self.turn @ vectors
 
     def __call__(self, vectors):
         """Return the corrected directions of directions (3, n)."""
+        vectors = self.turned(vectors)
         if self.velocity is not None:
             vectors = remove_aberration(vectors, self.velocity)
         return self.plane.deproject(self.transform.apply(
@@ -58,13 +67,13 @@ class Correction:
         """
         if self.velocity is None:
             return self
-        points = self.plane.project(vectors)
+        points = self.plane.project(self.turned(vectors))
         degree = max(self.transform.degree, 4)
         kind = type(self.transform)('polynomial', degree).fitted_to(points)
         targets = self.plane.project(self(vectors))
         coefficients = np.linalg.lstsq(kind.basis(points).T, targets.T,
                                        rcond=None)[0].T
-        return Correction(self.plane, kind, coefficients)
+        return Correction(self.plane, kind, coefficients, turn=self.turn)
 
 
 def sky_model(wcs, correction, vectors):
@@ -73,11 +82,14 @@ def sky_model(wcs, correction, vectors):
 
     The inverse of a polynomial is fitted at the directions (3, n) given.
     """
-    centre, turn = _plane_in(celestial_frame(wcs), correction.plane)
+    frame = celestial_frame(wcs)
+    centre, turn = _plane_in(frame, correction.plane)
     there = RotateCelestial2Native(*centre, 180) | Sky2Pix_TAN()
     back = Pix2Sky_TAN() | RotateNative2Celestial(*centre, 180)
-    middle = _plane_model(correction, turn, vectors)
+    middle = _plane_model(correction, turn, correction.turned(vectors))
     model = there | middle | back
+    if correction.turn is not None:
+        model = _turn_model(frame, correction) | model
     units = [u.Unit(unit) for unit in wcs.world_axis_units]
     latitude_first = 'lat' in wcs.world_axis_physical_types[0] or (
         wcs.world_axis_physical_types[0].endswith('.dec'))
@@ -90,6 +102,21 @@ def sky_model(wcs, correction, vectors):
     if latitude_first:
         model = Mapping((1, 0)) | model | Mapping((1, 0))
     return model
+
+
+def _turn_model(frame, correction):
+    """Return the model of the rotation of the sphere, in a frame."""
+    # A rotation takes the place that comes to the plane's centre there, and
+    # the directions around it to those around the centre.
+    before = TangentPlane(*(float(angle) for angle in directions(
+        correction.turn.T @ correction.plane.axes[0])))
+    old, old_turn = _plane_in(frame, before)
+    new, new_turn = _plane_in(frame, correction.plane)
+    # From the old axes of the frame, to ours, turned, and back.
+    inner = correction.plane.axes[1:] @ correction.turn @ before.axes[1:].T
+    roll = AffineTransformation2D(new_turn @ inner @ old_turn.T, [0.0, 0.0])
+    return (RotateCelestial2Native(*old, 180) | Sky2Pix_TAN() | roll
+            | Pix2Sky_TAN() | RotateNative2Celestial(*new, 180))
 
 
 def _plane_in(frame, plane):

@@ -9,6 +9,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 
 from photutils_mgauss.sky.tangent_plane import local_axes, unit_vectors
+from photutils_mgauss.utils.validation import as_integer, as_real
 
 STEP = 0.5  # pixels either side of a star for derivatives of a WCS
 
@@ -66,14 +67,20 @@ def pixel_to_vectors(wcs, x, y, *, bounded=True):
     return np.asarray(sky.cartesian.xyz.value)
 
 
-def pixel_jacobian(wcs, plane, x, y):
-    """Return d(plane)/d(pixel), shape (2, 2, n) [mas/pix]."""
+def pixel_jacobian(wcs, plane, x, y, turn=None):
+    """
+    Return d(plane)/d(pixel), shape (2, 2, n) [mas/pix].
+
+    ``turn`` (3, 3) is a rotation of the sphere between the two, if any.
+    """
     columns = []
     for dx, dy in ((STEP, 0), (0, STEP)):
         after, before = (
-            plane.project(pixel_to_vectors(wcs, x + sign * dx, y + sign * dy,
-                                           bounded=False))
-            for sign in (1, -1))
+            pixel_to_vectors(wcs, x + sign * dx, y + sign * dy,
+                             bounded=False) for sign in (1, -1))
+        if turn is not None:
+            after, before = turn @ after, turn @ before
+        after, before = plane.project(after), plane.project(before)
         columns.append((after - before) / (2 * STEP))
     return np.stack(columns, axis=1)
 
@@ -121,6 +128,12 @@ def invert_wcs(wcs, coordinates, *, start=None, tolerance=1e-7,
     array([90.   , 89.999])
     """
     check_celestial(wcs)
+    if not isinstance(coordinates, SkyCoord):
+        msg = ('coordinates must be a SkyCoord, got '
+               f'{type(coordinates).__name__}')
+        raise TypeError(msg)
+    tolerance = as_real(tolerance, 'tolerance', above=0)
+    max_iterations = as_integer(max_iterations, 'max_iterations', minimum=1)
     target = np.asarray(coordinates.icrs.cartesian.xyz.value)
     shape = target.shape[1:]
     target = target.reshape(3, -1)

@@ -8,6 +8,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 import photutils
+from astropy.table import Table
 from astropy.utils import minversion
 from photutils.psf import PSFPhotometry
 from photutils.utils._deprecation import DeprecatedColumnQTable
@@ -75,7 +76,7 @@ def prepare_inputs(photometry, data, mask, error, init_params):
         Without units; all None if no stars were found.
     """
     names = None
-    if init_params is not None and 'id' in init_params.colnames:
+    if isinstance(init_params, Table) and 'id' in init_params.colnames:
         names = np.asarray(init_params['id'])
     if names is None or names.dtype.kind not in 'USO':
         return photometry._prepare_fit_inputs(data, mask=mask, error=error,

@@ -57,7 +57,11 @@ def decode(flags, *, return_bit_values=False):
     TypeError, ValueError
         If ``flags`` are not integers, or negative.
     """
-    flags = np.ma.filled(np.ma.asarray(flags), 0)
+    try:
+        flags = np.ma.filled(np.ma.asarray(flags), 0)
+    except ValueError as error:
+        msg = f'flags must be an array of integers, got {flags!r:.80}'
+        raise TypeError(msg) from error
     if flags.dtype.kind not in 'ui':
         msg = f'flags must be integers, got dtype {flags.dtype}'
         raise TypeError(msg)

@@ -20,6 +20,17 @@ class Sources:
     selected: np.ndarray
 
 
+def check_table(table, name='table', needed=()):
+    """Raise an error unless it is a table that has the columns needed."""
+    if not isinstance(table, Table):
+        msg = f'{name} must be an astropy Table, got {type(table).__name__}'
+        raise TypeError(msg)
+    missing = [column for column in needed if column not in table.colnames]
+    if missing:
+        msg = f'{name} must have the column {missing[0]}, got none'
+        raise ValueError(msg)
+
+
 def read_sources(table, name='stars', *, first='', unit=None):
     """
     Return where the stars of a table are, and their fluxes if it has them.
@@ -40,9 +51,7 @@ def read_sources(table, name='stars', *, first='', unit=None):
     -------
     Sources
     """
-    if not isinstance(table, Table):
-        msg = f'{name} must be an astropy Table, got {type(table).__name__}'
-        raise TypeError(msg)
+    check_table(table, name)
     endings = dict.fromkeys((first, *_ENDINGS))
     end = next((e for e in endings if f'x{e}' in table.colnames), None)
     if end is None or f'y{end}' not in table.colnames:

@@ -5,10 +5,17 @@ About errors: a wrong type raises `TypeError`, a wrong value `ValueError`, and
 both are raised in the public call, never in a kernel. Trouble that belongs to
 one star or stamp of many is not an error: it becomes NaN and a flag.
 """
+from collections.abc import Iterable
 from numbers import Integral, Real
 
 import astropy.units as u
 import numpy as np
+
+# Above it, squares overflow; no counter or length of an array is longer.
+_LARGEST = 1e150
+_LONGEST = 2**31 - 1
+# No image has more pixels along an axis.
+_WIDEST = 10**6
 
 
 def in_pixels(value, name):
@@ -29,6 +36,23 @@ def in_pixels(value, name):
     return value
 
 
+def real_array(value, name):
+    """
+    Return ``value`` as a float64 array, without a copy where it is one.
+
+    Text, lists of different lengths and complex numbers are errors.
+    """
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind != 'c':
+            return array.astype(np.float64, copy=False)
+    except (TypeError, ValueError, OverflowError) as error:
+        msg = f'{name} must be an array of numbers, got {value!r:.80}'
+        raise TypeError(msg) from error
+    msg = f'{name} must be real, got complex numbers'
+    raise TypeError(msg)
+
+
 def as_floats(value, name, *, shape=None, finite=True):
     """
     Copy ``value`` into a new contiguous native float64 array.
@@ -36,12 +60,8 @@ def as_floats(value, name, *, shape=None, finite=True):
     ``shape`` is checked where given; None in it stands for any length. Units
     are refused, see `in_pixels`; masked numbers are not finite.
     """
-    value = in_pixels(value, name)
-    try:
-        array = np.array(value, dtype=np.float64, order='C', copy=True)
-    except (TypeError, ValueError) as error:
-        msg = f'{name} must be an array of numbers, got {value!r:.80}'
-        raise TypeError(msg) from error
+    array = np.array(real_array(in_pixels(value, name), name),
+                     dtype=np.float64, order='C', copy=True)
     if shape is not None:
         fits = array.ndim == len(shape) and all(
             want in (None, got)
@@ -57,6 +77,19 @@ def as_floats(value, name, *, shape=None, finite=True):
     return array
 
 
+def as_columns(**values):
+    """Return arrays of one length (n,); numbers stand for all."""
+    arrays = [np.atleast_1d(as_floats(value, name))
+              for name, value in values.items()]
+    lengths = {array.size for array in arrays if array.shape != (1,)}
+    if len(lengths) > 1 or any(array.ndim > 1 for array in arrays):
+        shapes = ', '.join(str(array.shape) for array in arrays)
+        msg = (f'{", ".join(values)} must have one shape (n,), or be '
+               f'numbers, got {shapes}')
+        raise ValueError(msg)
+    return [array.copy() for array in np.broadcast_arrays(*arrays)]
+
+
 def as_real(value, name, *, above=None, minimum=None, maximum=None):
     """Return ``value`` as a finite float within the limits given."""
     if isinstance(value, bool) or not isinstance(value, (Real, np.ndarray)):
@@ -66,7 +99,8 @@ def as_real(value, name, *, above=None, minimum=None, maximum=None):
     if not np.isfinite(value):
         msg = f'{name} must be finite, got {value}'
         raise ValueError(msg)
-    _check_limits(value, name, above, minimum, maximum)
+    _check_limits(value, name, above, minimum,
+                  _LARGEST if maximum is None else maximum)
     return value
 
 
@@ -75,7 +109,8 @@ def as_integer(value, name, *, minimum=None, maximum=None):
     if isinstance(value, bool) or not isinstance(value, Integral):
         msg = f'{name} must be an integer, got {value!r:.80}'
         raise TypeError(msg)
-    _check_limits(value, name, None, minimum, maximum)
+    _check_limits(value, name, None, minimum,
+                  _LONGEST if maximum is None else maximum)
     return int(value)
 
 
@@ -93,11 +128,12 @@ def _check_limits(value, name, above, minimum, maximum):
 
 def as_shape(value, name, *, minimum=1):
     """Return ``value``, an int or a pair of ints, as the tuple (ny, nx)."""
-    pair = (value, value) if np.ndim(value) == 0 else tuple(value)
+    pair = tuple(value) if isinstance(value, Iterable) else (value, value)
     if len(pair) != 2:
-        msg = f'{name} must be one integer or two (ny, nx), got {value!r}'
+        msg = f'{name} must be one integer or two (ny, nx), got {value!r:.80}'
         raise ValueError(msg)
-    return tuple(as_integer(n, name, minimum=minimum) for n in pair)
+    return tuple(as_integer(n, name, minimum=minimum, maximum=_WIDEST)
+                 for n in pair)
 
 
 def as_choice(value, name, choices):
@@ -106,4 +142,32 @@ def as_choice(value, name, choices):
         words = ', '.join(repr(choice) for choice in choices)
         msg = f'{name} must be one of {words}, got {value!r}'
         raise ValueError(msg)
+    return value
+
+
+def as_rng(value, name='rng'):
+    """Return a generator of random numbers; `value` may be its seed."""
+    try:
+        return np.random.default_rng(value)
+    except (TypeError, ValueError) as error:
+        msg = (f'{name} must be None, a numpy Generator, or a seed of '
+               f'non-negative integers, got {value!r:.80}')
+        raise type(error)(msg) from error
+
+
+def as_range(value, name):
+    """Return two finite numbers, the lower first."""
+    low, high = as_floats(value, name, shape=(2,))
+    if low > high:
+        msg = f'{name} must be (lower, higher), got ({low:g}, {high:g})'
+        raise ValueError(msg)
+    return low, high
+
+
+def as_instance(value, kind, name):
+    """Return ``value`` if it is an object of the class ``kind``."""
+    if not isinstance(value, kind):
+        msg = (f'{name} must be of the class {kind.__name__}, got '
+               f'{type(value).__name__}')
+        raise TypeError(msg)
     return value

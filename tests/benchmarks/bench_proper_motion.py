@@ -19,6 +19,7 @@ from astropy.io.fits import Header
 from astropy.table import Table
 from astropy.wcs import WCS
 from scipy.optimize import curve_fit
+from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from helpers.motion_scenes import (
@@ -28,6 +29,8 @@ from helpers.motion_scenes import (
     observe,
     pulls,
 )
+from helpers.one_epoch import gaia_table, make_sky, observe_once
+from helpers.one_epoch import pulls as one_epoch_pulls
 from photutils_mgauss import Epoch, ProperMotionFitter
 from photutils_mgauss.motions.frames import solve_frames
 from photutils_mgauss.motions.joint import reduce_all, solve_all
@@ -131,6 +134,52 @@ def bench_field_mean(n_fields=100):
     noise = 1 / np.sqrt(2 * len(pull))
     line(f'  pull of {len(pull)} field means (+- {noise:.2f})', '0.95-1.05',
          f'{rms(pull):.3f}')
+
+
+# One epoch and a catalogue like Gaia's
+
+def bench_one_epoch(n_fields=10):
+    heading('One epoch of 2004 and a catalogue of 2016: pulls, and beside '
+            'two epochs')
+    found, ratio, away = {True: [], False: []}, [], []
+    for seed in range(n_fields):
+        rng = np.random.default_rng(seed)
+        sky = make_sky(rng)
+        gaia, epoch = gaia_table(sky, rng), observe_once(sky, rng)
+        solution = ProperMotionFitter(references=gaia).fit([epoch])
+        for bright, pull in found.items():
+            pull.append(one_epoch_pulls(solution.stars, sky,
+                                        sky.bright == bright))
+        some = compare_with_two(gaia, epoch, sky)
+        ratio.append(some[0])
+        away.append(some[1])
+    for bright, pulls_ in found.items():
+        pull, word = np.hstack(pulls_), 'with' if bright else 'without'
+        line(f'  {word} a motion in the catalogue ({pull.size})',
+             '0.95-1.05', f'{rms(pull):.3f}')
+    line('  error over that of two epochs (least, most)', '1',
+         f'{np.min(ratio):.6f} {np.max(ratio):.6f}')
+    line('  largest difference of a motion, in its errors', '0',
+         f'{np.max(away):.4f}')
+
+
+def compare_with_two(gaia, epoch, sky):
+    """Return the ratios of errors, and differences of motions in those."""
+    keywords = {'systematic': None, 'clip': None, 'ref_epoch': 2016.0}
+    one = ProperMotionFitter(references=gaia, **keywords).fit([epoch]).stars
+    motions = gaia[sky.bright]
+    motions.remove_columns(['ra_error', 'dec_error'])
+    places = Epoch(gaia['ra', 'dec', 'ra_error', 'dec_error'], time=2016.0)
+    two = ProperMotionFitter(references=motions, **keywords).fit(
+        [epoch, places]).stars
+    two = two[two['n_good_obs'] == 2]
+    _, nearest = cKDTree(np.column_stack([two['ra'], two['dec']])).query(
+        np.column_stack([one['ra'], one['dec']]))
+    use = one['reference_row'] >= 0
+    one, two = one[use], two[nearest[use]]
+    error = one['pmra_error'].value
+    return (error / two['pmra_error'].value,
+            np.abs(one['pmra'].value - two['pmra'].value) / error)
 
 
 # The paper
@@ -432,7 +481,7 @@ def bench_matching(n):
          f'{wrong / sum(map(len, numbers)):.1e}')
 
 
-PARTS = ('pulls', 'paper', 'recipes', 'epochs', 'speed', 'whole')
+PARTS = ('pulls', 'one_epoch', 'paper', 'recipes', 'epochs', 'speed', 'whole')
 
 
 def main():
@@ -447,6 +496,8 @@ def main():
     if 'pulls' in parts:
         bench_pulls()
         bench_field_mean()
+    if 'one_epoch' in parts:
+        bench_one_epoch()
     if 'paper' in parts:
         bench_fig11()
     if 'recipes' in parts:
