@@ -18,8 +18,9 @@ pytestmark = pytest.mark.skipif(
 NOT_CALLED = {
     'CramerRao', 'FitStatus', 'InjectionResult', 'MixtureFit',
     'MixtureFitter', 'MixturePosterior', 'Optics', 'PixelMotionSolution',
-    'PixelPhaseError', 'Scene', 'ShapeStatus', 'Shapes', 'SimulatedCatalogue', 'TunedMixtureField',
-    'UnfinishedTilesError', 'read_psfex', 'sample_mixture'}
+    'PixelPhaseError', 'Scene', 'ShapeStatus', 'Shapes', 'SimulatedCatalogue',
+    'TunedMixtureField', 'UnfinishedTilesError', 'read_psfex',
+    'sample_mixture'}
 
 
 @pytest.fixture(scope='module')
