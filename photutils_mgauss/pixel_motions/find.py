@@ -150,8 +150,9 @@ def motion_grid(campaign, grid, max_motion):
 
 def _search(campaign, grid, motions, known, executor):
     """Return the largest T of all motions on the grid, and which it is."""
-    maps = [_on_grid(campaign, grid, k, light) for k, light in enumerate(
-        known)]
+    *maps, edges = zip(*(_on_grid(campaign, grid, k, light) for k, light in
+                         enumerate(known)), strict=True)
+    maps = list(zip(*maps, strict=True))
     scales = _scales(maps)
     weight = sum(c**2 * m for c, (_, m) in zip(scales, maps, strict=True))
     evidence = [np.float32(c) * n for c, (n, _) in zip(scales, maps,
@@ -162,10 +163,13 @@ def _search(campaign, grid, motions, known, executor):
     turn = np.linalg.inv(grid.matrix)
     shifts = [(turn @ motions.T).T * (year - campaign.working_year)
               for year in campaign.years]
+    # Beside an edge a star of some motions is seen and of others is not.
+    margin = 2 + max(np.abs(shift).max() for shift in shifts)
+    whole = np.logical_and.reduce([edge > margin for edge in edges])
     summed = map_parallel(partial(_along, evidence, shifts),
                           range(len(motions)), executor=executor)
     for v, total in enumerate(summed):
-        score = np.where(weight > 0, total / noise, 0)
+        score = np.where((weight > 0) & whole, total / noise, 0)
         larger = score > best
         best[larger], which[larger] = score[larger], v
     covered = weight > 0
@@ -209,17 +213,18 @@ def _moved(values, n, axis):
 
 
 def _on_grid(campaign, grid, k, light):
-    """Return n and m of image k on the grid."""
+    """Return n, m and the distance to the edge of image k on the grid."""
     x, y = _pixels_on(campaign, grid, k)
-    inside = ((x > -0.5) & (x < campaign.shapes[k][1] - 0.5)
-              & (y > -0.5) & (y < campaign.shapes[k][0] - 0.5))
-    out = []
+    depth = np.minimum(
+        np.minimum(x + 0.5, campaign.shapes[k][1] - 0.5 - x),
+        np.minimum(y + 0.5, campaign.shapes[k][0] - 0.5 - y))
+    inside, out = depth > 0, []
     for image, order in zip(_filtered(campaign, k, light), (3, 1),
                             strict=True):
         got = map_coordinates(image, [y, x], order=order, mode='nearest',
                               output=np.float32)
         out.append(np.where(inside, got, np.float32(0)))
-    return out[0], np.maximum(out[1], 0)
+    return out[0], np.maximum(out[1], 0), np.abs(depth)
 
 
 def _pixels_on(campaign, grid, k):
