@@ -20,7 +20,8 @@ WIDTH, COLUMN, GAP, STAIRS, TOP = 996, 140, 14, 40, 20
 HEIGHTS = {False: 72, True: 124}  # of floors without and with narrow rooms
 # First column and number of columns of each room.
 COLUMNS = {
-    'cli': (0, 7), 'plotting': (0, 1), 'simulation': (1, 1),
+    'cli': (0, 7), 'plotting': (0, 1), 'pixel_motions': (5, 2),
+    'simulation': (1, 1),
     'fitting': (2, 1), 'field': (3, 1), 'crowded': (4, 1),
     'photometry': (5, 1), 'motions': (6, 1), 'psf': (0, 6),
     'kernels': (0, 3), 'files': (3, 3), 'sky': (6, 1), 'utils': (0, 7)}

@@ -9,6 +9,8 @@ The data flow, top to bottom::
                  one QTable per exposure  <--------------+
                             |
                          motions -> tables, corrected WCS, plotting
+                            |
+            images -> pixel_motions -> tables, light curves
 
 Every public name is loaded on first use, so that importing the package costs
 little more than importing photutils.
@@ -68,6 +70,9 @@ _OWNERS = {
     'Epoch': 'motions',
     'MotionSolution': 'motions',
     'ProperMotionFitter': 'motions',
+    'ImageEpoch': 'pixel_motions',
+    'PixelMotionFitter': 'pixel_motions',
+    'PixelMotionSolution': 'pixel_motions',
     'Band': 'simulation',
     'crowded_field': 'simulation',
     'CSST_BANDS': 'simulation',

@@ -4,7 +4,7 @@ import warnings
 from functools import cache, partial
 from pathlib import Path
 
-from photutils_mgauss.cli import photometry, tools
+from photutils_mgauss.cli import photometry, pixel_motions, tools
 from photutils_mgauss.cli import psf as psf_command
 from photutils_mgauss.cli.observers import check_observer, observer_at
 from photutils_mgauss.cli.progress import Progress
@@ -38,6 +38,7 @@ def add(commands):
     parser.add_argument('--format', choices=('ecsv', 'fits'), default='ecsv',
                         help='of the tables (default: %(default)s)')
     _add_solution(parser)
+    pixel_motions.add_options(parser)
     tools.add_times(parser)
     psf_command.add_fit(parser)
     photometry.add_measuring(parser)
@@ -97,6 +98,9 @@ def _add_solution(parser):
 
 def run(options):
     """Measure the motions."""
+    if options.pixels:
+        pixel_motions.run(options)
+        return
     paths = options.inputs
     _check(options)
     folder = Path(options.output)
@@ -127,6 +131,7 @@ def run(options):
 
 def _check(options):
     """Raise for what is wrong before anything is read."""
+    pixel_motions.check_alone(options)
     tools.check_inputs([*options.inputs, options.references, options.stars,
                         options.parallax_of])
     if options.parallax_of and (options.references or options.plane):

@@ -150,7 +150,10 @@ def _motion_panels(table, solved, free):
     # The motions of references are what a catalogue says.
     stars = table[solved & free]
     with np.errstate(invalid='ignore', divide='ignore'):
-        magnitude = -2.5 * np.log10(column_values(stars, 'flux'))
+        flux = column_values(stars, 'flux')
+        if flux.ndim > 1:  # one for each image
+            flux = np.nanmean(flux, axis=1)
+        magnitude = -2.5 * np.log10(flux)
     errors = {name: column_values(stars, f'{name}_error')
               for name in ('pmra', 'pmdec')}
     if np.isfinite(magnitude).any():

@@ -31,6 +31,11 @@ FLAGS = {
     256: 'relative: motions are relative to the mean of the stars',
     512: ('inconsistent: the detections do not agree with one straight '
           'motion; the star was not used to tie the frames'),
+    65536: ('not_converged: the fit to the pixels did not come to its end'),
+    131072: ('position_only: the images that show the star were taken at too '
+             'few times for a motion; it was held fixed'),
+    262144: ('wandered: the fit to the pixels went farther from the place '
+             'given than half a stamp'),
 }
 GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
 STRONG = 0.3
@@ -42,7 +47,11 @@ def visibility_periods(sightings, used):
 
     ``used`` (E, n) are those of the `Sightings` that count.
     """
-    years, gap = sightings.years, period(sightings.baseline)
+    return groups_in_time(sightings.years, period(sightings.baseline), used)
+
+
+def groups_in_time(years, gap, used):
+    """Return the number of groups (n,), more than a gap [yr] apart."""
     order = np.argsort(np.nanmean(years, axis=1))
     last = np.full(used.shape[1], -np.inf)
     count = np.zeros(used.shape[1], dtype=int)
@@ -119,17 +128,38 @@ def star_table(fit, ref_year, parameters):
 
 
 def _add_parameters(table, fit, parameters, solved):
-    unit = u.Unit(fit.setup.sightings.unit)
+    setup = fit.setup
     values, covariance = parameters
     values[:, ~solved] = np.nan
     covariance[..., ~solved] = np.nan
-    has_parallax = bool(fit.setup.options.parallax)
-    values, covariance, extra = _gaia_order(values, covariance, has_parallax,
-                                            fit.setup.options.acceleration)
+    add_parameters(table, values, covariance, u.Unit(setup.sightings.unit),
+                   on_sky=setup.sightings.plane is not None,
+                   parallax=bool(setup.options.parallax),
+                   acceleration=setup.options.acceleration)
+
+
+def add_parameters(table, values, covariance, unit, *, on_sky, parallax,
+                   acceleration):
+    """
+    Add the columns of what is fitted to stars, in Gaia's order and names.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+    values, covariance : (p, n) and (p, p, n) `~numpy.ndarray`
+        Position (in degrees on the sky), motion, parallax, acceleration;
+        the last two where they were fitted.
+    unit : `~astropy.units.UnitBase`
+        Of errors, parallaxes and, per year, motions.
+    on_sky, parallax, acceleration : bool
+        Whether positions are on the sky, and what was fitted.
+    """
+    values, covariance, extra = _gaia_order(values, covariance, parallax,
+                                            acceleration)
     sigma = [np.sqrt(covariance[k][k]) for k in range(5)]
     units = (unit, unit, unit, unit / u.yr, unit / u.yr)
     names, scale = (('ra', 'dec'), u.deg)
-    if fit.setup.sightings.plane is None:
+    if not on_sky:
         names, scale = ('x', 'y'), unit
     for name, value in zip(names, values, strict=False):
         table[name] = value * scale
@@ -139,7 +169,7 @@ def _add_parameters(table, fit, parameters, solved):
         table[f'{name}_error'] = sigma[k] * units[k]
     for i in range(5):
         for j in range(i + 1, 5):
-            with np.errstate(invalid='ignore'):
+            with np.errstate(invalid='ignore', divide='ignore'):
                 rho = covariance[i][j] / (sigma[i] * sigma[j])
             table[f'{GAIA[i]}_{GAIA[j]}_corr'] = rho
     for k, name in enumerate(('accra', 'accdec')):

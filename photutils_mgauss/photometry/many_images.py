@@ -18,14 +18,21 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from photutils_mgauss import kernels
 from photutils_mgauss.photometry.engine import (
     as_model,
-    cut_boxes,
     is_fixed_shape,
     kernel_image,
     psf_arrays,
 )
+from photutils_mgauss.photometry.joint_pixels import (
+    TOLERANCE,
+    JointFit,
+    JointImages,
+    Views,
+    boxes_around,
+    covariances,
+)
+from photutils_mgauss.sky.observers import add_aberration
 from photutils_mgauss.sky.tangent_plane import TangentPlane, directions
 from photutils_mgauss.sky.wcs import (
     check_celestial,
@@ -39,13 +46,8 @@ from photutils_mgauss.utils.validation import as_shape
 
 __all__ = ['add_sky_positions', 'fit_many', 'to_flux_densities']
 
-_MAX_STEPS = 100
-
 # The flux density of AB magnitude 0 [Jy].
 _AB_ZERO = u.ABflux.to(u.Jy)
-
-# Of the next step [pix], as for single images.
-_TOLERANCE = 1e-6
 
 
 def add_sky_positions(table, wcs):
@@ -270,257 +272,178 @@ def fit_many(images, coordinates, *, fit_shape=11, common_flux=False):
     >>> round(float(stars['ra'][0].value % 360), 9)
     0.0
     """
-    scene = _Images(images, coordinates, as_shape(fit_shape, 'fit_shape'),
-                    bool(common_flux))
-    state = scene.start()
+    fit_shape = as_shape(fit_shape, 'fit_shape')
+    images = list(images)
+    if not images:
+        msg = 'images must have at least one element, got none'
+        raise ValueError(msg)
+    if not isinstance(coordinates, SkyCoord):
+        msg = f'coordinates must be a SkyCoord, got {coordinates!r:.80}'
+        raise TypeError(msg)
+    pixels, psfs, frames, units = zip(*map(_read_image, images), strict=True)
+    if any(unit != units[0] for unit in units):
+        msg = f'images must have one unit, got {units}'
+        raise ValueError(msg)
+    joint, scale = joint_images(
+        pixels, psfs, np.zeros(len(images), int) if common_flux else
+        np.arange(len(images)), fit_sky=False)
+    vectors = np.asarray(coordinates.reshape(-1).icrs.cartesian.xyz.value)
+    plane = TangentPlane.around(vectors)
+    state, converged = _fit_places(joint, frames, plane,
+                                   plane.project(vectors), fit_shape)
+    weighted = all(image.error.size for image in joint.images)
+    return _table(state, converged, plane, scale, units[0], weighted)
+
+
+def joint_images(pixels, psfs, shared, *, fit_sky):
+    """
+    Return images as fits of many take them, and the unit of their light.
+
+    Parameters
+    ----------
+    pixels : sequence of `~photutils_mgauss.utils.image.PixelData`
+        All in one unit.
+    psfs : sequence of `~photutils_mgauss.psf.base.PSFModel`
+        Of fixed shape.
+    shared : (E,) `~numpy.ndarray` of int
+        The number of the flux of each image.
+    fit_sky : bool
+        Whether each star has a sky in each image.
+
+    Returns
+    -------
+    `~photutils_mgauss.photometry.joint_pixels.JointImages`
+    float
+        The light that counts as 1 there: of the order of the noise, so that
+        nothing is lost to rounding whatever the unit is.
+    """
+    levels = [_typical(one.with_error().error) for one in pixels]
+    scale = float(np.median(levels))
+    images = [kernel_image(one.data / scale, None if one.error is None
+                           else one.error / scale, one.mask)
+              for one in pixels]
+    return JointImages(images, [psf_arrays(psf) for psf in psfs],
+                       np.asarray(shared), fit_sky), scale
+
+
+def _typical(error):
+    """Return the median of errors that are positive and finite, else 1."""
+    sample = error[::max(1, len(error) // 100)]
+    good = sample[(sample > 0) & np.isfinite(sample)]
+    return float(np.median(good)) if good.size else 1.0
+
+
+def _fit_places(joint, frames, plane, origin, fit_shape):
+    """Return the state of all stars at rest, and who converged."""
+    n, rest = origin.shape[1], np.eye(2)[:, :, None]
+    shapes = [image.data.shape for image in joint.images]
+    values = np.ascontiguousarray(origin.T)[:, None]
+    fit = None
     for _ in range(3):
         # Within a fit the WCS is a linear map: make it anew at the result.
-        state, converged = _minimize(scene, state)
-        moved = scene.linearize(state)
-        if not (moved > _TOLERANCE).any():
-            break
-    return scene.table(scene.evaluate(state.values), converged)
+        views = views_of(frames, plane, values, [rest] * len(frames))
+        if fit is not None:
+            moved = np.abs(views.pixels - fit.views.places(
+                values, np.arange(n)))
+            if not (np.nan_to_num(moved) > TOLERANCE).any():
+                break
+        boxes = (boxes_around(views.pixels, fit_shape, shapes)
+                 if fit is None else fit.boxes)
+        fit = JointFit(joint, views, boxes, np.ones((n, 1, 2), bool))
+        state, converged = fit.minimize()
+        values = state.values
+    return state, converged
 
 
-class _Equations:
-    """Values (n, p) and the normal equations there, star by star."""
+def views_of(frames, plane, values, factors, velocities=None):
+    """
+    Return where groups of stars are seen.
 
-    def __init__(self, values, chi2, matrix, gradient):
-        self.values = values
-        self.chi2 = chi2
-        self.matrix = matrix
-        self.gradient = gradient
+    Parameters
+    ----------
+    frames : (E,) sequence of APE 14 WCS
+    plane : `~photutils_mgauss.sky.tangent_plane.TangentPlane`
+    values : (g, m, p) `~numpy.ndarray`
+        Parameters of which each image sees a place in the plane.
+    factors : (E,) sequence of (2, p, g m) or (2, p, 1) `~numpy.ndarray`
+        The derivatives of the place in the plane by the parameters.
+    velocities : (E,) sequence of (3,) `~numpy.ndarray` or None, optional
+        Of observers whose aberration the images show [c].
 
-    def merge(self, other, where):
-        """Return these equations, those of other where it says so."""
-        def choose(a, b):
-            return np.where(where.reshape(-1, *[1] * (a.ndim - 1)), b, a)
-        return _Equations(*(choose(getattr(self, name), getattr(other, name))
-                            for name in ('values', 'chi2', 'matrix',
-                                         'gradient')))
+    Returns
+    -------
+    `~photutils_mgauss.photometry.joint_pixels.Views`
+    """
+    n, m, p = values.shape
+    velocities = [None] * len(frames) if velocities is None else velocities
+    pixels = np.empty((n, len(frames), m, 2))
+    slopes = np.zeros((n, len(frames), m, 2, p))
+    flat = values.reshape(n * m, p)
+    for k, wcs in enumerate(frames):
+        place = np.einsum('apn,np->an', np.broadcast_to(
+            factors[k], (2, p, n * m)), flat)
+        xy, inverse = _pixels_of(wcs, plane, place, velocities[k])
+        pixels[:, k] = xy.reshape(n, m, 2)
+        slope = np.einsum('nab,bpn->nap', inverse, np.broadcast_to(
+            factors[k], (2, p, n * m)))
+        slopes[:, k] = np.nan_to_num(slope).reshape(n, m, 2, p)
+    return Views(values, pixels, slopes)
 
 
-class _Images:
-    """The images, and where the stars are on them."""
+def _pixels_of(wcs, plane, place, velocity):
+    """Return pixels (n, 2) and d(pixel)/d(plane) (n, 2, 2); NaN and 0."""
+    vectors = plane.deproject(place)
+    if velocity is not None:
+        vectors = add_aberration(vectors, velocity)
+    x, y = invert_wcs(wcs, SkyCoord(*directions(vectors), unit='deg'))
+    forward = np.moveaxis(pixel_jacobian(wcs, plane, x, y), -1, 0)
+    good = np.isfinite(forward).all(axis=(1, 2))
+    inverse = np.zeros(forward.shape)
+    inverse[good] = np.linalg.inv(forward[good])
+    return np.column_stack([x, y]), inverse
 
-    def __init__(self, images, coordinates, fit_shape, common_flux):
-        images = list(images)
-        if not images:
-            msg = 'images must have at least one element, got none'
-            raise ValueError(msg)
-        if not isinstance(coordinates, SkyCoord):
-            msg = f'coordinates must be a SkyCoord, got {coordinates!r:.80}'
-            raise TypeError(msg)
-        self.images, self.psfs, self.wcs, units = zip(
-            *map(_read_image, images), strict=True)
-        self.unit = units[0]
-        if any(unit != self.unit for unit in units):
-            msg = f'images must have one unit, got {units}'
-            raise ValueError(msg)
-        self.n_fluxes = 1 if common_flux else len(images)
-        icrs = coordinates.reshape(-1).icrs
-        vectors = np.asarray(icrs.cartesian.xyz.value)
-        self.plane = TangentPlane.around(vectors)
-        self.origin = self.plane.project(vectors).T
-        self._place(self.origin)
-        self.boxes = [_boxes(xy, fit_shape, image.data.shape) for xy, image
-                      in zip(self.pixels, self.images, strict=True)]
 
-    def _place(self, sky):
-        """Find pixels and Jacobians at places (n, 2) in the plane."""
-        self.sky = sky.copy()
-        self.pixels, self.jacobians = [], []
-        place = SkyCoord(*directions(self.plane.deproject(sky.T)), unit='deg')
-        for wcs in self.wcs:
-            x, y = invert_wcs(wcs, place)
-            forward = np.moveaxis(pixel_jacobian(wcs, self.plane, x, y), -1, 0)
-            good = np.isfinite(forward).all(axis=(1, 2))
-            inverse = np.zeros(forward.shape)
-            inverse[good] = np.linalg.inv(forward[good])
-            self.pixels.append(np.column_stack([x, y]))
-            self.jacobians.append(inverse)
-
-    def linearize(self, state):
-        """Map the WCS anew; return by how many pixels stars moved, (n,)."""
-        sky = state.values[:, :2]
-        before = [self._positions(k, sky) for k in range(len(self.images))]
-        self._place(sky)
-        return np.max([np.nan_to_num(np.abs(a - b)).max(axis=1) for a, b in
-                       zip(before, self.pixels, strict=True)], axis=0)
-
-    def _positions(self, k, sky):
-        shift = np.einsum('nij,nj->ni', self.jacobians[k], sky - self.sky)
-        return self.pixels[k] + shift
-
-    def _single(self, k, sky, flux):
-        """Return the equations of image k alone."""
-        n, image = len(sky), self.images[k]
-        xy = self._positions(k, sky)
-        seen = self.boxes[k][:, 2:].all(axis=1)
-        values = np.column_stack([flux, np.where(seen[:, None], xy, 0.0)])
-        single = kernels.SingleEquations(
-            np.empty(n), np.empty((n, 3, 3)), np.empty((n, 3)),
-            np.empty(n, np.int64))
-        kernels.star_equations(image, self.boxes[k], values, self.psfs[k],
-                               kernels.BoxScratch.empty(1, self.boxes[k]),
-                               single)
-        if (single.n_pixels < 0).any():
-            msg = ('images must have positive and finite errors under the '
-                   f'stars, got one that is not in image {k}')
-            raise ValueError(msg)
-        return single
-
-    def start(self):
-        """Return the equations at the linear fluxes at the coordinates."""
-        n = len(self.origin)
-        flux = np.ones((n, self.n_fluxes))
-        curve, slope = np.zeros((2, n, self.n_fluxes))
-        for k in range(len(self.images)):
-            f = k % self.n_fluxes
-            single = self._single(k, self.origin, flux[:, f])
-            curve[:, f] += single.matrices[:, 0, 0]
-            slope[:, f] += single.gradients[:, 0]
-        flux += slope / np.where(curve > 0, curve, 1)
-        return self.evaluate(np.hstack([self.origin, flux]))
-
-    def evaluate(self, values):
-        """Return the joint equations at values (n, 2 + fluxes)."""
-        n, size = values.shape
-        chi2 = np.zeros(n)
-        matrix, gradient = np.zeros((n, size, size)), np.zeros((n, size))
-        self.n_pixels = np.zeros(n, np.int64)
-        for k in range(len(self.images)):
-            f = 2 + k % self.n_fluxes
-            single = self._single(k, values[:, :2], values[:, f])
-            # From (flux, x, y) of the image to (sky, flux) of the star.
-            turn = np.zeros((n, 3, size))
-            turn[:, 0, f] = 1
-            turn[:, 1:, :2] = self.jacobians[k]
-            matrix += np.einsum('nia,nij,njb->nab', turn, single.matrices,
-                                turn)
-            gradient += np.einsum('nia,ni->na', turn, single.gradients)
-            chi2 += single.chi2
-            self.n_pixels += single.n_pixels
-        return _Equations(values, chi2, matrix, gradient)
-
-    def pixel_length(self, step):
-        """Return the length of steps (n, p) in pixels, or relative flux."""
-        return np.max([np.abs(np.einsum('nij,nj->ni', jacobian, step[:, :2]))
-                       .max(axis=1) for jacobian in self.jacobians], axis=0)
-
-    def table(self, state, converged):
-        n, size = state.values.shape
-        covariance = np.full((n, size, size), np.nan)
-        for i in range(n):
-            covariance[i] = _inverse(state.matrix[i])
-        with np.errstate(divide='ignore', invalid='ignore'):
-            free = np.count_nonzero(np.diagonal(
-                state.matrix, axis1=1, axis2=2) > 0, axis=1)
-            dof = self.n_pixels - free
-            scatter = np.where(dof > 0, state.chi2 / dof, np.nan)
-        weighted = all(image.error.size for image in self.images)
-        if not weighted:
-            covariance *= scatter[:, None, None]
-        table = QTable({'id': np.arange(1, n + 1)})
-        vectors = self.plane.deproject(state.values[:, :2].T)
-        _add_columns(table, vectors, self.plane, covariance[:, :2, :2])
-        errors = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)[:, 2:])
-        flux = np.where(np.isfinite(errors), state.values[:, 2:], np.nan)
-        if self.n_fluxes == 1 and len(self.images) > 1:
-            flux, errors = flux[:, 0], errors[:, 0]
-        unit = 1 if self.unit is None else self.unit
-        table['flux_fit'], table['flux_err'] = flux * unit, errors * unit
-        table['n_pixels_fit'] = self.n_pixels
-        table['reduced_chi2'] = scatter if weighted else np.nan
-        table['converged'] = converged
-        return table
+def _table(state, converged, plane, scale, unit, weighted):
+    """Return the table of `fit_many`."""
+    n, n_fluxes = len(state.values), state.fluxes.shape[1]
+    covariance, flux_variance = covariances(state)
+    n_pixels = state.n_pixels.sum(axis=1)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        dof = (n_pixels - 2 * (np.einsum('nii->ni', state.matrix) > 0).all(
+            axis=1) - (state.known[:, :, 0, 0] > 0).sum(axis=1))
+        scatter = np.where(dof > 0, state.chi2 / dof, np.nan)
+    factor = 1.0 if weighted else scatter[:, None]
+    table = QTable({'id': np.arange(1, n + 1)})
+    _add_columns(table, plane.deproject(state.values[:, 0].T), plane,
+                 covariance * np.reshape(factor, (-1, 1, 1)))
+    errors = np.sqrt(flux_variance[:, :, 0] * factor) * scale
+    flux = np.where(np.isfinite(errors), state.fluxes[:, :, 0] * scale,
+                    np.nan)
+    if n_fluxes == 1 and state.n_pixels.shape[1] > 1:
+        flux, errors = flux[:, 0], errors[:, 0]
+    unit = 1 if unit is None else unit
+    table['flux_fit'], table['flux_err'] = flux * unit, errors * unit
+    table['n_pixels_fit'] = n_pixels
+    table['reduced_chi2'] = scatter if weighted else np.nan
+    table['converged'] = converged
+    return table
 
 
 def _read_image(entry):
-    """Return the image, PSF arrays, WCS and unit of one (data, psf, wcs)."""
+    """Return the pixels, PSF, WCS and unit of one (data, psf, wcs)."""
     if len(entry) != 3:
         msg = f'images must hold (data, psf, wcs), got {len(entry)} things'
         raise ValueError(msg)
     data, psf, wcs = entry
     check_celestial(wcs)
+    pixels = read_pixels(data, name='data of images')
+    return pixels, fixed_psf(psf), wcs, pixels.unit
+
+
+def fixed_psf(psf):
+    """Return a PSF as a model of fixed shape, or raise."""
     psf = as_model(psf)
     if not is_fixed_shape(psf):
         msg = f'images must hold PSFs of fixed shape, got {psf!r:.80}'
         raise TypeError(msg)
-    pixels = read_pixels(data, name='data of images')
-    image = kernel_image(pixels.data, pixels.error, pixels.mask)
-    return image, psf_arrays(psf), wcs, pixels.unit
-
-
-def _boxes(xy, fit_shape, data_shape):
-    near = ((xy > -100) & (xy < np.array(data_shape[::-1]) + 100)).all(axis=1)
-    boxes = np.zeros((len(xy), 4), np.int64)
-    boxes[near] = cut_boxes(*xy[near].T, fit_shape, data_shape)
-    return boxes
-
-
-def _inverse(matrix):
-    """Return the inverse, NaN where nothing is known of a parameter."""
-    known = np.diag(matrix) > 0
-    out = np.full(matrix.shape, np.nan)
-    scale = np.sqrt(np.diag(matrix)[known])
-    if known.any():
-        scaled = matrix[np.ix_(known, known)] / np.outer(scale, scale)
-        if np.linalg.cond(scaled) < 1e14:
-            out[np.ix_(known, known)] = (np.linalg.inv(scaled)
-                                         / np.outer(scale, scale))
-    return out
-
-
-def _minimize(scene, state):
-    """Minimize chi2 of all stars; return the state and who converged."""
-    n = len(state.values)
-    damping = np.zeros(n)
-    done = np.zeros(n, bool)
-    for _ in range(_MAX_STEPS):
-        step = _steps(state, damping)
-        # No star moves farther than a pixel at a time.
-        length = scene.pixel_length(step)
-        step *= np.minimum(1, 1 / np.maximum(length, 1e-300))[:, None]
-        step[done] = 0
-        trial = scene.evaluate(state.values + step)
-        better = trial.chi2 <= state.chi2 * (1 + 1e-12) + 1e-300
-        done |= (length < _TOLERANCE) & (damping < 1)
-        gain = _gain(state, trial, step)
-        state = state.merge(trial, better & ~done)
-        damping = np.where(better, next_dampings(damping, gain),
-                           np.maximum(10 * damping, 1e-3))
-        if done.all():
-            break
-    return state, done
-
-
-def _gain(state, trial, step):
-    """Return what steps brought over what the normal equations promised."""
-    expected = (2 * np.einsum('ni,ni->n', step, state.gradient)
-                - np.einsum('ni,nij,nj->n', step, state.matrix, step))
-    # Of a smaller fall nothing is left after rounding: keep the damping.
-    known = expected > 1e-9 * state.chi2
-    return np.divide(state.chi2 - trial.chi2, expected, where=known,
-                     out=np.full(len(step), kernels.POOR_GAIN))
-
-
-def next_dampings(damping, gain):
-    """Return what `kernels.next_damping` does, for many fits (n,) at once."""
-    return np.select(
-        [gain < kernels.POOR_GAIN, gain < kernels.FAIR_GAIN, damping > 1e-4],
-        [np.maximum(4 * damping, 1e-2), damping, damping / 10], 0.0)
-
-
-def _steps(state, damping):
-    """Return the Levenberg-Marquardt steps (n, p) of all stars."""
-    diagonal = np.diagonal(state.matrix, axis1=1, axis2=2)
-    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1))
-    scaled = state.matrix / (scale[:, :, None] * scale[:, None, :])
-    scaled += np.einsum('n,ij->nij', damping, np.eye(scale.shape[1]))
-    # What no pixel knows of stays where it is.
-    scaled += np.where(diagonal > 0, 0, 1)[:, :, None] * np.eye(
-        scale.shape[1])
-    steps = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) @ (
-        state.gradient / scale)[..., None]
-    return steps[..., 0] / scale
+    return psf

@@ -260,6 +260,25 @@ def motions_of_stars():
     }
 
 
+def pixel_motions(**options):
+    images, known = options.pop('images'), options.pop('stars')
+    return mg.PixelMotionFitter(**options).fit(images, known)
+
+
+def motions_of_pixels():
+    taken = {**pixels(), 'psf': grid(), 'wcs': wcs(), 'band': 'g',
+             'observer': 'l2'}
+    return {
+        'ImageEpoch': (mg.ImageEpoch, {**taken, 'time': 2020.0}),
+        'PixelMotionFitter': (pixel_motions, {
+            'images': [mg.ImageEpoch(**taken, time=year)
+                       for year in (2020.0, 2021.0)],
+            'stars': places(), 'parallax': False, 'acceleration': False,
+            'references': None, 'fit_shape': 11, 'fit_sky': True,
+            'forced': False, 'progress_bar': False, 'flux': 'image'}),
+    }
+
+
 def scenes():
     psf, instrument = grid(), mg.Instrument(shape=SHAPE)
     sky = mg.sky_field(8, 9, size=0.5, rng=1)
@@ -317,7 +336,7 @@ def instruments():
 
 
 PARTS = (mixtures, models, shapes, fields, stars_of_images, motions_of_stars,
-         scenes, instruments)
+         motions_of_pixels, scenes, instruments)
 
 
 def all_calls():

@@ -18,7 +18,7 @@ from photutils_mgauss import (
     kernels,
 )
 from photutils_mgauss.photometry.engine import sort_groups
-from photutils_mgauss.photometry.many_images import next_dampings
+from photutils_mgauss.photometry.joint_pixels import next_dampings
 
 MIXTURE = GaussianMixture.from_stddevs(
     [0.6, 0.4], [[0, 0], [0.1, 0]], [[1.2, 1.1], [2, 2.2]], [0.1, 0])

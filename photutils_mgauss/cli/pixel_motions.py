@@ -1,0 +1,177 @@
+"""``mgauss motions --pixels``: motions from the pixels of all images."""
+from functools import cache, partial
+from pathlib import Path
+
+from photutils_mgauss.cli import tools
+from photutils_mgauss.cli.observers import check_observer, observer_at
+from photutils_mgauss.cli.progress import Progress
+from photutils_mgauss.cli.results import Results, file_marks
+
+_TABLES = ('motions', 'light_curves', 'images')
+
+
+def add_options(parser):
+    """Add what only this way of measuring motions needs."""
+    group = parser.add_argument_group('motions from pixels')
+    group.add_argument('--pixels', action='store_true',
+                       help='fit each star to the pixels of all images '
+                            'together; takes --psf')
+    group.add_argument('--psf', nargs='+', metavar='FILE',
+                       help='with --pixels: the PSF of all images, or one of '
+                            'each')
+    group.add_argument('--frames', metavar='FOLDER',
+                       help='with --pixels: what mgauss motions wrote of '
+                            'these exposures before, for the corrected WCS '
+                            '(default: the WCS of the images)')
+    group.add_argument('--targets', metavar='TABLE',
+                       help='with --pixels: ra and dec of the stars '
+                            '(default: those found in all images together)')
+    group.add_argument('--forced', action='store_true',
+                       help='with --targets: fit fluxes only, at the places '
+                            'and motions of the table')
+
+
+def check_alone(options):
+    """Raise for options that need --pixels, which is not given."""
+    for name in ('psf', 'frames', 'targets', 'forced'):
+        if getattr(options, name):
+            msg = f'--{name} must be given with --pixels only'
+            raise ValueError(msg)
+
+
+def run(options):
+    """Measure the motions."""
+    paths, folder = options.inputs, Path(options.output)
+    _check(options)
+    names = {name: folder / f'{name}.{options.format}' for name in _TABLES}
+    owners = tools.one_each(options.psf, len(paths), 'psf')
+    read = tools.read_images(options, paths)
+    results = Results(options)
+    results.claim(list(names.values()), [*paths, *options.psf])
+    with Progress(len(paths) + 2, options) as step:
+        epochs, marks = [], []
+        for i, path in enumerate(paths):
+            step(f'read {path}')
+            image = read(i)
+            frame = _frame(options, i)
+            epochs.append(_epoch(options, image, owners[i], frame))
+            marks.append([file_marks(path, owners[i], frame),
+                          image.content])
+            tools.say(options, f'{path}: {epochs[i]!r}')
+        step('find and fit stars')
+        solve = cache(partial(_solve, options, epochs))
+        key = results.key(marks, file_marks(options.targets))
+        tables = [results.obtain(path, f'{key}_{name}', partial(
+            _made, options, solve, name), _read_table)
+            for name, path in names.items()]
+        step(f'write to {folder}')
+        results.deliver()
+    tools.say(options, *_summary(options, tables[0]),
+              f'files are in {folder}')
+
+
+def _check(options):
+    """Raise for what is wrong before anything is read."""
+    if not options.psf:
+        msg = '--pixels must have --psf, the PSF of all images or of each'
+        raise ValueError(msg)
+    if options.forced and not options.targets:
+        msg = '--forced must have --targets, a table of places'
+        raise ValueError(msg)
+    if options.plane or options.parallax_of or options.references:
+        msg = ('--pixels must be given without --plane, --parallax-of and '
+               '--references; the frames come from --frames')
+        raise ValueError(msg)
+    tools.check_inputs([*options.inputs, *options.psf, options.targets])
+    tools.check_different(options.inputs)
+    check_observer(options.observer, len(options.inputs))
+    folder = Path(options.output)
+    if folder.exists() and not folder.is_dir():
+        msg = f'{folder}: --output must be a folder, but is a file'
+        raise NotADirectoryError(msg)
+
+
+def _frame(options, i):
+    """Return the file with the corrected WCS of an image, or None."""
+    if options.frames is None:
+        return None
+    name = tools.output_names(options.inputs, options.frames, '_wcs', (),
+                              '.fits')[i]
+    for suffix in ('.asdf', '.fits'):
+        if name.with_suffix(suffix).is_file():
+            return name.with_suffix(suffix)
+    msg = (f'--frames must be a folder of mgauss motions with the WCS of '
+           f'all images, got no {name.with_suffix("").name} in '
+           f'{options.frames}')
+    raise ValueError(msg)
+
+
+def _epoch(options, image, psf, frame):
+    """Return the `ImageEpoch` of an image."""
+    from photutils_mgauss.cli.psf_files import read_psf
+    from photutils_mgauss.files.image_layers import read_wcs
+    from photutils_mgauss.pixel_motions import ImageEpoch
+    with tools.about(psf):
+        model = read_psf(psf)
+    wcs = image.wcs if frame is None else read_wcs(frame)
+    with tools.about(image.path):
+        for what, value, option in (('a WCS', wcs, '--wcs or --frames'),
+                                    ('a time', image.time, '--time')):
+            if value is None:
+                msg = f'must have {what}, got none; give {option}'
+                raise ValueError(msg)
+        observer = observer_at(options.observer, image.path, options.inputs,
+                               image.time)
+        data = image.without_sky
+        if image.unit is not None:
+            data = data * image.unit
+        error = image.noise.background
+        return ImageEpoch(data, model, wcs, image.time, mask=image.mask,
+                          error=error if image.unit is None
+                          else error * image.unit, observer=observer)
+
+
+def _solve(options, epochs):
+    """Return the solution."""
+    from photutils_mgauss.files.tables import read_table
+    from photutils_mgauss.pixel_motions import PixelMotionFitter
+    stars = None
+    if options.targets is not None:
+        stars, _ = read_table(options.targets)
+    fitter = PixelMotionFitter(parallax=options.parallax,
+                               forced=options.forced,
+                               fit_shape=options.fit_shape)
+    return fitter.fit(epochs, stars)
+
+
+def _made(options, solve, name):
+    """Return one of the tables of a solution, and what writes it."""
+    solution = solve()
+    table = getattr(solution, {'motions': 'stars', 'light_curves': 'fluxes',
+                               'images': 'images'}[name])
+    return table, partial(tools.write_table, table, record=tools.record_of(
+        options, notes=list(solution.notes)))
+
+
+def _read_table(path):
+    from photutils_mgauss.files.tables import read_table
+    return read_table(path)[0]
+
+
+def _summary(options, stars):
+    """Return lines on what came out, and on what catalogues gave."""
+    lines = [f'{len(stars)} stars at the places given' if options.forced else
+             f'{len(stars)} stars, {_solved(stars)} with proper motions']
+    if options.frames is not None:
+        found = [file for file in Path(options.frames).glob('motions.*')
+                 if file.suffix in ('.ecsv', '.fits')]
+        if found:
+            lines.append(f'catalogues gave {_solved(_read_table(found[0]))}')
+    return lines
+
+
+def _solved(stars):
+    import numpy as np
+    error = np.ma.filled(np.ma.asarray(getattr(
+        stars['pmra_error'], 'value', stars['pmra_error'])), np.nan)
+    return int(np.isfinite(error).sum())

@@ -1,0 +1,505 @@
+r"""
+Stars fitted to the pixels of many images together: arrays in, arrays out.
+
+A star has p parameters v that say where it is, in image k at the pixel
+:math:`x_k + J_k (v - v_0)`, one flux in each image (or for several images in
+common), and a level of the sky in each image. Fluxes and skies enter
+linearly. For given places they are solved for exactly, so that only v is
+searched, and chi2 as a function of v alone has the gradient and matrix
+
+.. math::
+
+    g = \sum_k J_k^T \gamma_k, \quad
+    S = \sum_k J_k^T W_k J_k - \sum_c C_c D_c^{-1} C_c^T ,
+
+with the products :math:`W_k` of the star's derivatives in image k, the
+:math:`D_c` of the images that share the flux c, and :math:`C_c` of both. All
+come from `~photutils_mgauss.kernels.group_moments`, in which the sky has been
+eliminated. Groups of m neighbours are fitted together: v is that of all.
+
+Arrays have the g groups first: (g, m, p) parameters, (g, E, m) of E images.
+"""
+from dataclasses import dataclass, fields
+from functools import cache
+
+import numpy as np
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from photutils_mgauss import kernels
+from photutils_mgauss.photometry.engine import cut_boxes
+
+_MAX_STEPS = 60
+
+# Of the next step [pix], as for single images, or in standard errors.
+TOLERANCE = 1e-6
+_SMALL = 1e-10
+
+# Of the data, what chi2 may rise by for nothing.
+_ROUNDING = 1e-14
+
+# Where no longer step lowers chi2 either, a small one is the last.
+_HOPELESS = 1e8
+
+# How many points a likelihood is sampled at, and how much wider they lie than
+# the Gaussian of its peak.
+_SAMPLES = 128
+_WIDE = 1.5
+
+# The least eigenvalue of a matrix of unit diagonal that says enough.
+_SINGULAR = 1e-11
+
+# How far beyond an image a box may still be thought of [pix].
+_FAR = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """
+    Where g groups of m stars are seen in E images, and how that changes.
+
+    Attributes
+    ----------
+    values : (g, m, p) `~numpy.ndarray`
+        Parameters at which the following are.
+    pixels : (g, E, m, 2) `~numpy.ndarray`
+        Places x, y; NaN where an image cannot show the star.
+    slopes : (g, E, m, 2, p) `~numpy.ndarray`
+        Their derivatives by the parameters, 0 where there is no place.
+    """
+
+    values: np.ndarray
+    pixels: np.ndarray
+    slopes: np.ndarray
+
+    def places(self, values, rows):
+        """Return the pixels (r, E, m, 2) of some groups at other values."""
+        shift = np.einsum('gemip,gmp->gemi', self.slopes[rows],
+                          values - self.values[rows])
+        return self.pixels[rows] + shift
+
+
+@dataclass(frozen=True, eq=False)
+class JointImages:
+    """
+    The pixels: E images, their PSFs, and what stars have in common.
+
+    Attributes
+    ----------
+    images : list of `~photutils_mgauss.kernels.Image`
+    psfs : list of tuple
+        See `~photutils_mgauss.photometry.engine.psf_arrays`.
+    shared : (E,) `~numpy.ndarray` of int
+        The number, from 0, of the flux of each image.
+    fit_sky : bool
+        Whether each image of a group has a level of the sky.
+    """
+
+    images: list
+    psfs: list
+    shared: np.ndarray
+    fit_sky: bool
+
+    @property
+    def n_fluxes(self):
+        """The number of different fluxes of a star."""
+        return int(self.shared.max()) + 1
+
+    def moments(self, k, boxes, places, own):
+        """Return the moments of groups in image k, the sky among them."""
+        n, m = boxes.shape[:2]
+        size = 3 * m + self.fit_sky
+        out = kernels.GroupMoments(
+            np.empty((n, size, size)), np.empty((n, size)), np.empty(n),
+            np.empty(n, np.int64))
+        kernels.group_moments(self.images[k], boxes,
+                              np.ascontiguousarray(places), own, self.psfs[k],
+                              np.zeros(3 * m + 1), kernels.BoxScratch.empty(
+                                  m, boxes.reshape(-1, 4)), out)
+        if (out.n_pixels < 0).any():
+            msg = ('images must have positive and finite errors under the '
+                   f'stars, got one that is not in image {k}; mask such '
+                   'pixels')
+            raise ValueError(msg)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """
+    The moments of g groups in E images, the sky eliminated.
+
+    Attributes
+    ----------
+    products : (g, E, 3 m, 3 m) `~numpy.ndarray`
+        Of the stars' basis images: PSF and derivatives of each.
+    data : (g, E, 3 m) `~numpy.ndarray`
+    squares : (g, E) `~numpy.ndarray`
+    n_pixels : (g, E) `~numpy.ndarray` of int
+    sky : (g, E, 2 + 3 m) `~numpy.ndarray`
+        The weight of the sky, its product with the data, and with the basis
+        images; zeros if there is none.
+    """
+
+    products: np.ndarray
+    data: np.ndarray
+    squares: np.ndarray
+    n_pixels: np.ndarray
+    sky: np.ndarray
+
+    @classmethod
+    def of(cls, joint, boxes, places, own):
+        """Return those at places (g, E, m, 2)."""
+        n, n_images, m = boxes.shape[:3]
+        size = 3 * m
+        out = cls(np.empty((n, n_images, size, size)),
+                  np.empty((n, n_images, size)), np.empty((n, n_images)),
+                  np.empty((n, n_images), np.int64),
+                  np.zeros((n, n_images, 2 + size)))
+        for k in range(n_images):
+            mine = np.empty((0, m, 3)) if own is None else (
+                np.ascontiguousarray(own[:, k]))
+            out._fill(k, joint.moments(
+                k, np.ascontiguousarray(boxes[:, k]), places[:, k], mine))
+        return out
+
+    def _fill(self, k, raw):
+        size = self.data.shape[2]
+        self.n_pixels[:, k] = raw.n_pixels
+        self.products[:, k] = raw.products[:, :size, :size]
+        self.data[:, k] = raw.data[:, :size]
+        self.squares[:, k] = raw.squares
+        if raw.data.shape[1] == size:
+            return
+        weight, light = raw.products[:, -1, -1], raw.data[:, -1]
+        cross = raw.products[:, -1, :size]
+        self.sky[:, k] = np.column_stack([weight, light, cross])
+        share = cross / np.where(weight > 0, weight, 1)[:, None]
+        self.products[:, k] -= share[:, :, None] * cross[:, None, :]
+        self.data[:, k] -= share * light[:, None]
+        self.squares[:, k] -= light**2 / np.where(weight > 0, weight, 1)
+
+    def levels(self, fluxes):
+        """Return the sky (g, E) at fluxes (g, E, m)."""
+        weight = np.where(self.sky[..., 0] > 0, self.sky[..., 0], np.nan)
+        light = np.einsum('gem,gem->ge', self.sky[..., 2::3], fluxes)
+        return (self.sky[..., 1] - light) / weight
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """
+    Values (g, m, p), chi2 (g,), and its equations with fluxes eliminated.
+
+    ``squares`` (g,) is the chi2 of no stars,
+    ``matrix`` (g, m p, m p) and ``gradient`` (g, m p) are those of the
+    parameters alone, ``fluxes`` (g, C, m) the best at these places, ``known``
+    (g, C, m, m) the inverse of their own matrix and ``cross`` (g, C, m p, m)
+    what joins both. ``curves`` (g, E, m, 2, m, 2) are the products of the
+    derivatives in each image, for a flux of 1, ``slopes`` (g, E, m, 2) the
+    gradients there, ``weights`` (g, E, m) the inverse variances of fluxes
+    that the image alone has of the star alone, ``excess`` (g, E, m) the
+    products of the PSF with what is left of the data.
+    """
+
+    values: np.ndarray
+    chi2: np.ndarray
+    squares: np.ndarray
+    matrix: np.ndarray
+    gradient: np.ndarray
+    fluxes: np.ndarray
+    known: np.ndarray
+    cross: np.ndarray
+    curves: np.ndarray
+    slopes: np.ndarray
+    weights: np.ndarray
+    excess: np.ndarray
+    n_pixels: np.ndarray
+    sky: np.ndarray
+
+    def take(self, rows):
+        """Return the state of some groups."""
+        return State(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def put(self, rows, other, where):
+        """Take over some groups from the state of others."""
+        for f in fields(self):
+            getattr(self, f.name)[rows[where]] = getattr(other, f.name)[where]
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """
+    Groups to fit, to some `JointImages`.
+
+    Attributes
+    ----------
+    joint : JointImages
+    views : Views
+    boxes : (g, E, m, 4) `~numpy.ndarray` of int
+        The pixels of each star; see `boxes_around`.
+    free : (g, m, p) `~numpy.ndarray` of bool
+        Which parameters are fitted.
+    own : (g, E, m, 3) `~numpy.ndarray` or None
+        Light of the stars that the images are without.
+    """
+
+    joint: JointImages
+    views: Views
+    boxes: np.ndarray
+    free: np.ndarray
+    own: np.ndarray | None = None
+
+    def evaluate(self, values, rows):
+        """Return the `State` of some groups (r,) at values (r, m, p)."""
+        views = self.views
+        places = views.places(values, rows)
+        boxes = self.boxes[rows]
+        seen = boxes[..., 2:].all(axis=-1)
+        places = np.where(seen[..., None], places, 0.0)
+        moments = Moments.of(self.joint, boxes, places,
+                             None if self.own is None else self.own[rows])
+        return _state(self.joint, values, views.slopes[rows], moments)
+
+    def minimize(self):
+        """Return the `State` at the least chi2, and who converged (g,)."""
+        n = len(self.free)
+        state = self.evaluate(self.views.values.copy(), np.arange(n))
+        damping, done = np.zeros(n), np.zeros(n, bool)
+        for _ in range(_MAX_STEPS):
+            rows = np.flatnonzero(~done)
+            if not rows.size:
+                break
+            now = state.take(rows)
+            step, small = self._step(now, damping[rows], rows)
+            done[rows[small & ((damping[rows] < 1)
+                               | (damping[rows] > _HOPELESS))]] = True
+            trial = self.evaluate(now.values + step.reshape(now.values.shape),
+                                  rows)
+            better = trial.chi2 <= now.chi2 + _ROUNDING * now.squares
+            gain = _gain(now, trial, step)
+            state.put(rows, trial, better)
+            damping[rows] = np.where(
+                better, next_dampings(damping[rows], gain),
+                np.maximum(10 * damping[rows], 1e-3))
+        return state, done
+
+    def _step(self, state, damping, rows):
+        """Return damped steps (r, m p), at most a pixel, and which end."""
+        free = self.free[rows].reshape(len(rows), -1)
+        step = solve_free(state.matrix, state.gradient, free, damping)
+        promised = np.einsum('ni,ni->n', step, state.gradient)
+        shift = np.einsum('gemip,gmp->gemi', self.views.slopes[rows],
+                          step.reshape(state.values.shape))
+        length = np.abs(shift).max(axis=(1, 2, 3))
+        # No star moves farther than a pixel at a time.
+        step *= np.minimum(1, 1 / np.maximum(length, 1e-300))[:, None]
+        return step, (length < TOLERANCE) | (promised < _SMALL)
+
+    def spread(self, state, faint):
+        r"""
+        Return the mean squares (g, p, p) of the likelihood about its peak.
+
+        Where the signal is low the likelihood is not a Gaussian. It is
+        sampled at points :math:`v + L z` of a wider Gaussian, weighted by
+        what it is there; NaN where ``faint`` (g,) does not ask for it. Only
+        for single stars.
+        """
+        n, _, p = state.values.shape
+        out = np.full((n, p, p), np.nan)
+        rows = np.flatnonzero(faint)
+        if not rows.size:
+            return out
+        now = state.take(rows)
+        inverses, _ = fixed_inverse(now.matrix, self.free[rows, 0])
+        values, vectors = np.linalg.eigh(inverses)
+        root = vectors * np.sqrt(np.maximum(values, 0))[:, None, :]
+        points = _points(p)
+        steps = _WIDE * np.einsum('nij,sj->sni', root, points)
+        weight = np.stack([self._likelihood(now, step, rows)
+                           for step in steps])
+        weight += 0.5 * np.sum(points**2, axis=1)[:, None]
+        weight = np.exp(weight - weight.max(axis=0))
+        out[rows] = np.einsum('sn,sni,snj->nij', weight / weight.sum(axis=0),
+                              steps, steps, optimize=True)
+        return out
+
+    def _likelihood(self, state, step, rows):
+        """Return the logarithm of the likelihood a step from the peak."""
+        there = self.evaluate(state.values + step[:, None], rows)
+        return (state.chi2 - there.chi2) / 2
+
+
+@cache
+def _points(size):
+    """Return evenly spread points (s, size) of a Gaussian."""
+    uniform = qmc.Sobol(size, rng=np.random.default_rng(1)).random(_SAMPLES)
+    return ndtri(uniform)
+
+
+def boxes_around(pixels, fit_shape, shapes):
+    """Return boxes (g, E, m, 4) in images of some shapes around places."""
+    boxes = np.zeros((*pixels.shape[:3], 4), np.int64)
+    for k, shape in enumerate(shapes):
+        xy = pixels[:, k]
+        with np.errstate(invalid='ignore'):
+            near = ((xy > -_FAR) & (xy < np.array(shape[::-1]) + _FAR)).all(
+                axis=-1)
+        boxes[:, k][near] = cut_boxes(*xy[near].T, fit_shape, shape)
+    return boxes
+
+
+# The algebra.
+
+def _state(joint, values, slopes, moments):
+    """Return the `State` that moments (g, E, ...) make."""
+    n, n_images, size = moments.data.shape
+    m = size // 3
+    fluxes, known, chi2 = _best_fluxes(joint, moments)
+    flux = fluxes[:, joint.shared]
+    place = np.arange(size).reshape(m, 3)[:, 1:].ravel()
+    curves = moments.products[:, :, place[:, None], place].reshape(
+        n, n_images, m, 2, m, 2)
+    joins = moments.products[:, :, place][..., ::3].reshape(
+        n, n_images, m, 2, m)
+    pulls = (moments.data[:, :, place].reshape(n, n_images, m, 2)
+             - np.einsum('geiam,gem->geia', joins, flux))
+    pulls = pulls * flux[..., None]
+    turned = slopes * flux[..., None, None]
+    p = values.shape[2]
+    gradient = np.einsum('geiap,geia->gip', slopes, pulls)
+    half = np.einsum('geiajb,gejbq->geiajq', curves, turned)
+    matrix = np.einsum('geiap,geiajq->gipjq', turned, half)
+    matrix = matrix.reshape(n, m * p, m * p)
+    cross = np.zeros((n, joint.n_fluxes, m * p, m))
+    each = np.einsum('geiap,geiam->geipm', turned, joins).reshape(
+        n, n_images, m * p, m)
+    for k in range(n_images):
+        cross[:, joint.shared[k]] += each[:, k]
+    matrix -= np.einsum('gcpi,gcij,gcqj->gpq', cross, known, cross,
+                        optimize=True)
+    return State(values, chi2, moments.squares.sum(axis=1), matrix,
+                 gradient.reshape(n, m * p), fluxes, known, cross, curves,
+                 pulls,
+                 np.einsum('geii->gei', moments.products[..., ::3, ::3]),
+                 moments.data[..., ::3] - np.einsum(
+                     'geij,gej->gei', moments.products[..., ::3, ::3], flux),
+                 moments.n_pixels,
+                 moments.levels(flux))
+
+
+def _best_fluxes(joint, moments):
+    """Return fluxes (g, C, m), their inverse matrices, and chi2 (g,)."""
+    n, _, size = moments.data.shape
+    m, count = size // 3, joint.n_fluxes
+    matrix, light = np.zeros((n, count, m, m)), np.zeros((n, count, m))
+    for k, c in enumerate(joint.shared):
+        matrix[:, c] += moments.products[:, k, ::3, ::3]
+        light[:, c] += moments.data[:, k, ::3]
+    known = inverse(matrix)
+    fluxes = np.einsum('gcij,gcj->gci', known, light)
+    chi2 = moments.squares.sum(axis=1) - np.einsum('gci,gci->g', fluxes,
+                                                   light)
+    return fluxes, known, chi2
+
+
+def inverse(matrices):
+    """
+    Return the inverses of symmetric matrices (..., m, m).
+
+    Rows and columns of what nothing is known about are 0.
+    """
+    diagonal = np.einsum('...ii->...i', matrices)
+    known = diagonal > 0
+    scale = np.where(known, 1 / np.sqrt(np.where(known, diagonal, 1)), 0)
+    if matrices.shape[-1] == 1:
+        return (scale * scale)[..., None]
+    scaled = matrices * scale[..., :, None] * scale[..., None, :]
+    size = matrices.shape[-1]
+    # A ridge far below what pixels can tell keeps twins apart.
+    ridge = np.where(known, 1e-13, 1.0)
+    scaled[..., np.arange(size), np.arange(size)] += ridge
+    return (np.linalg.inv(scaled) * scale[..., :, None]
+            * scale[..., None, :])
+
+
+def solve_free(matrix, gradient, free, damping):
+    """Return the Levenberg-Marquardt steps (g, s) of the free parameters."""
+    size = matrix.shape[1]
+    free = free & (np.einsum('nii->ni', matrix) > 0)
+    diagonal = np.where(free, np.einsum('nii->ni', matrix), 1)
+    scale = np.where(free, 1 / np.sqrt(diagonal), 0)
+    scaled = matrix * scale[:, :, None] * scale[:, None, :]
+    scaled[:, np.arange(size), np.arange(size)] += np.where(
+        free, damping[:, None] + 1e-13, 1.0)
+    steps = np.linalg.solve(scaled, (gradient * scale)[..., None])
+    return steps[..., 0] * scale
+
+
+def covariances(state, free=None):
+    """
+    Return the covariances of parameters, and the variances of fluxes.
+
+    Parameters
+    ----------
+    state : State
+    free : (g, m, p) `~numpy.ndarray` of bool, optional
+        Which parameters have been fitted; the others get NaN.
+
+    Returns
+    -------
+    (g, m p, m p) `~numpy.ndarray`
+        NaN where the pixels do not tell.
+    (g, C, m) `~numpy.ndarray`
+        NaN where no pixel shows the star.
+    """
+    n, size = state.gradient.shape
+    free = np.ones((n, size), bool) if free is None else free.reshape(n, size)
+    covariance, known = fixed_inverse(state.matrix, free)
+    share = np.einsum('gcpm,gcmi->gcpi', state.cross, state.known)
+    flux = np.einsum('gcmm->gcm', state.known) + np.einsum(
+        'gcpi,gpq,gcqi->gci', share, covariance, share, optimize=True)
+    shown = np.einsum('gcmm->gcm', state.known) > 0
+    unknown = ~known[:, :, None] | ~known[:, None, :]
+    return (np.where(unknown, np.nan, covariance),
+            np.where(shown, flux, np.nan))
+
+
+def fixed_inverse(matrices, free):
+    """
+    Return inverses (g, s, s), 0 for what is not free, and what is known.
+
+    What is free of a matrix that is singular is not known.
+    """
+    diagonal = np.einsum('nii->ni', matrices)
+    informed = free & (diagonal > 0)
+    scale = np.where(informed, 1 / np.sqrt(np.where(informed, diagonal, 1)),
+                     0)
+    scaled = matrices * scale[:, :, None] * scale[:, None, :]
+    size = matrices.shape[1]
+    scaled[:, np.arange(size), np.arange(size)] += ~informed
+    scaled = np.where(np.isfinite(scaled), scaled, np.eye(size))
+    sound = (informed | ~free).all(axis=1) & (
+        np.linalg.eigvalsh(scaled)[:, 0] > _SINGULAR)
+    scaled[~sound] = np.eye(size)
+    inverses = (np.linalg.inv(scaled) * scale[:, :, None]
+                * scale[:, None, :])
+    inverses[~sound] = 0
+    return inverses, free & sound[:, None]
+
+
+def _gain(state, trial, step):
+    """Return what steps brought over what the equations promised."""
+    expected = (2 * np.einsum('ni,ni->n', step, state.gradient)
+                - np.einsum('ni,nij,nj->n', step, state.matrix, step))
+    # Of a smaller fall nothing is left after rounding: keep the damping.
+    known = expected > 1e-9 * state.chi2
+    return np.divide(state.chi2 - trial.chi2, expected, where=known,
+                     out=np.full(len(step), kernels.POOR_GAIN))
+
+
+def next_dampings(damping, gain):
+    """Return what `kernels.next_damping` does, for many fits (n,) at once."""
+    return np.select(
+        [gain < kernels.POOR_GAIN, gain < kernels.FAIR_GAIN, damping > 1e-4],
+        [np.maximum(4 * damping, 1e-2), damping, damping / 10], 0.0)

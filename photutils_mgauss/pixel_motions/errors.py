@@ -1,0 +1,170 @@
+r"""
+Errors of stars: those of the pixels, and those of the frames on top.
+
+At a low signal the fluxes that weight the images are themselves noisy. The
+matrix S of the fit has :math:`\hat f^2` where the slope of the likelihood has
+:math:`\hat f^2 - \sigma_f^2` on average, A. The scatter of the minimum is
+
+.. math:: \mathrm{Cov}(v) = A^{-1} S A^{-1},
+
+which is :math:`S^{-1}` for bright stars. For the faintest the likelihood is
+not even a Gaussian, and its sampled mean squares stand for these. The search
+for the place makes fluxes too large, too, by
+
+.. math:: \frac{\Delta f}{f} = \frac{1}{2 D} \sum_k \mathrm{tr}
+    (G_k J_k S^{-1} J_k^T).
+"""
+from dataclasses import dataclass
+
+import numpy as np
+
+from photutils_mgauss.photometry.joint_pixels import fixed_inverse
+
+# The least that A may be of S: below, the fit is no longer near its truth.
+_LEAST = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """
+    Errors of n stars.
+
+    Attributes
+    ----------
+    covariance : (p, p, n) `~numpy.ndarray`
+        Of the parameters; NaN for what was not fitted or is not known.
+    flux_error : (n, E) `~numpy.ndarray`
+        Of the flux of each image, 1 alone or in common; NaN if not seen.
+    flux_bias : (n, E) `~numpy.ndarray`
+        The part of each flux that is due to the search for its place.
+    plain : (n, p, p) `~numpy.ndarray`
+        The inverses of S, 0 for what was not fitted.
+    """
+
+    covariance: np.ndarray
+    flux_error: np.ndarray
+    flux_bias: np.ndarray
+    plain: np.ndarray
+
+
+def errors_of(campaign, solved):
+    """Return the `Errors` of a `Solved`."""
+    n, p = solved.values.shape
+    n_images = campaign.n_images
+    covariance = np.full((n, p, p), np.nan)
+    plain, variance = np.zeros((n, p, p)), np.full((n, n_images), np.nan)
+    bias = np.zeros((n, n_images))
+    for group, state in zip(solved.groups, solved.states, strict=True):
+        whole, inverses, known = _covariances(
+            campaign, solved.slopes[group], state, solved.free[group])
+        spread = _flux_variance(state, whole)
+        for c in range(group.shape[1]):
+            rows, own = group[:, c], slice(c * p, c * p + p)
+            unknown = ~known[:, own, None] | ~known[:, None, own]
+            sampled = np.isfinite(solved.spread[rows])
+            covariance[rows] = np.where(unknown, np.nan, np.where(
+                sampled, solved.spread[rows], whole[:, own, own]))
+            plain[rows] = inverses[:, own, own]
+            variance[rows] = spread[:, campaign.joint.shared, c]
+            bias[rows] = _bias(campaign, solved, rows,
+                               inverses[:, own, own])
+    variance = np.where(solved.weights > 0, variance, np.nan)
+    return Errors(np.moveaxis(covariance, 0, -1), np.sqrt(variance), bias,
+                  plain)
+
+
+def _covariances(campaign, slopes, state, free):
+    """Return covariances of groups (g, m p, m p), S^-1, and what is known."""
+    g, m, _, _, p = slopes.shape
+    size = m * p
+    noise = state.known[:, campaign.joint.shared]
+    turned = np.einsum('geij,geiajb->geiajb', noise, state.curves)
+    half = np.einsum('geiajb,gjebq->geiajq', turned, slopes)
+    drop = np.einsum('gieap,geiajq->gipjq', slopes, half).reshape(
+        g, size, size)
+    free = free.reshape(g, size)
+    inverses, known = fixed_inverse(state.matrix, free)
+    values, vectors = np.linalg.eigh(inverses)
+    root = np.einsum('gij,gj,gkj->gik', vectors,
+                     np.sqrt(np.maximum(values, 0)), vectors)
+    loss, turn = np.linalg.eigh(root @ drop @ root)
+    stretch = 1 / np.maximum(1 - loss, _LEAST)
+    inner = np.einsum('gij,gj,gkj->gik', turn, stretch**2, turn)
+    return root @ inner @ root, inverses, known
+
+
+def _flux_variance(state, covariance):
+    """Return the variances of fluxes (g, C, m)."""
+    share = np.einsum('gcpm,gcmi->gcpi', state.cross, state.known)
+    return np.einsum('gcmm->gcm', state.known) + np.einsum(
+        'gcpi,gpq,gcqi->gci', share, covariance, share, optimize=True)
+
+
+def _bias(campaign, solved, rows, covariance):
+    """Return the relative bias of fluxes (r, E)."""
+    slopes, curves = solved.slopes[rows], solved.curves[rows]
+    spread = np.einsum('neip,npq,nejq->neij', slopes, covariance, slopes,
+                       optimize=True)
+    trace = np.einsum('neij,neij->ne', curves, spread)
+    out = np.zeros(trace.shape)
+    for c in range(campaign.joint.n_fluxes):
+        same = campaign.joint.shared == c
+        weight = solved.weights[rows][:, same].sum(axis=1)
+        bias = 0.5 * trace[:, same].sum(axis=1) / np.where(weight > 0,
+                                                           weight, 1)
+        out[:, same] = bias[:, None]
+    return np.minimum(out, 0.5)
+
+
+def frame_covariance(solution, campaign, solved, plain):
+    r"""
+    Return what the errors of frames add to covariances, (p, p, n).
+
+    A change r of the maps moves a star by :math:`S^{-1} \sum_k J_k^T W_k
+    (\partial x / \partial \xi)_k A_k r`, with the basis A of the maps there.
+
+    Parameters
+    ----------
+    solution : `~photutils_mgauss.motions.solution.MotionSolution`
+        The frames are those of the WCS of the images.
+    campaign, solved, plain
+        The images, the stars, and the inverses of their matrices.
+    """
+    fit = solution._fit
+    epochs = _epochs_of(solution, campaign)
+    frames, transform = fit.frames, fit.setup.transform
+    n, p = solved.values.shape
+    size = frames.factor.shape[1]
+    factor = frames.factor.reshape(len(solution.epochs), 2, -1, size)
+    place = fit.setup.sightings.plane.project(
+        campaign.plane.deproject(solved.values[:, :2].T))
+    basis = transform.basis(place)
+    total = np.zeros((n, p, size))
+    for k, e in enumerate(epochs):
+        weight = solved.curves[:, k] * solved.fluxes[:, k, None, None]**2
+        slope = solved.slopes[:, k]
+        pull = np.einsum('nip,nij,njx->npx', slope, weight, slope[..., :2])
+        moved = np.einsum('xbq,bn->nxq', factor[e], np.nan_to_num(basis))
+        total += pull @ moved
+    total = plain @ total
+    return np.einsum('npq,nrq->prn', total, total)
+
+
+def _epochs_of(solution, campaign):
+    """Return the number of the epoch of a solution for each image."""
+    if solution._fit.setup.sightings.plane is None:
+        msg = 'references must be a MotionSolution on the sky, got a plane'
+        raise ValueError(msg)
+    years = np.array([epoch.mean_year for epoch in solution.epochs])
+    found = []
+    for k, year in enumerate(campaign.years):
+        away = np.abs(years - year)
+        e = int(np.argmin(away))
+        if len(years) == campaign.n_images and away[k] == away[e]:
+            e = k
+        if away[e] > 1e-5:
+            msg = ('references must be a MotionSolution of the epochs of the '
+                   f'images, got none at {year:.6f}, the time of image {k}')
+            raise ValueError(msg)
+        found.append(e)
+    return found

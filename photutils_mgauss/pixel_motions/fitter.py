@@ -1,0 +1,314 @@
+"""
+Motions of stars from the pixels of all epochs: the public class.
+
+Lang, Hogg, Jester and Rix (2009, AJ 137, 4400) showed that a model of one
+moving star for all images reaches the bound of the whole data.
+"""
+import warnings
+from copy import copy
+from dataclasses import replace
+from functools import partial
+
+import astropy.units as u
+import numpy as np
+from astropy.table import vstack
+from astropy.utils.exceptions import AstropyUserWarning
+from scipy.spatial import cKDTree
+
+from photutils_mgauss.motions import MotionSolution
+from photutils_mgauss.pixel_motions.campaign import read_campaign
+from photutils_mgauss.pixel_motions.errors import (
+    errors_of,
+    frame_covariance,
+)
+from photutils_mgauss.pixel_motions.find import BRIGHT, Grid, candidates
+from photutils_mgauss.pixel_motions.solution import PixelMotionSolution
+from photutils_mgauss.pixel_motions.solve import fwhm, solve
+from photutils_mgauss.pixel_motions.stars import read_stars
+from photutils_mgauss.pixel_motions.tables import (
+    BAD_POSITION,
+    NOT_CONVERGED,
+    WANDERED,
+    chi2_of,
+    image_table,
+    shift_notes,
+    star_table,
+)
+from photutils_mgauss.utils.validation import as_choice, as_real, as_shape
+
+UNSURE = NOT_CONVERGED | WANDERED | BAD_POSITION
+FLUXES = ('image', 'band', 'common')
+NOBODY = ('No image shows any of the stars: the images lie elsewhere on the '
+          'sky, or the WCS is not theirs.')
+NO_OVERLAP = ('No star is shown by images of two times: the images do not '
+              'overlap, and no motions can be fitted.')
+
+
+class PixelMotionFitter:
+    """
+    Positions, motions and fluxes of stars from the pixels of all epochs.
+
+    Parameters
+    ----------
+    parallax : bool, optional
+        Whether parallaxes are fitted.
+    acceleration : bool, optional
+        Whether accelerations are fitted.
+    references : `MotionSolution`, optional
+        The solution that the WCS of the images come from: the covariance of
+        its frames is added to that of each star. Without it the WCS are
+        taken as they are.
+    fit_shape : int or (ny, nx) tuple of int, optional
+        The pixels of each star in each image.
+    fit_sky : bool, optional
+        Whether a level of the sky is fitted to each star in each image.
+    forced : bool, optional
+        Whether places and motions are those of the stars given, and only
+        fluxes are fitted.
+    executor : `~concurrent.futures.Executor`, optional
+        Where the work is done; the default is threads on all processors.
+    progress_bar : bool, optional
+        Whether to show how far the work is.
+    flux : {'image', 'band', 'common'}, optional
+        What has a flux of its own: each image, each band, or nothing but
+        the star. Fluxes in common make faint stars a little more precise;
+        they need images of one scale and stars that do not vary.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import (
+    ...     ImageEpoch, Instrument, paper_exposures, PixelMotionFitter,
+    ...     simulate_epochs, sky_field)
+    >>> sources = sky_field(4, 4, size=0.12, magnitudes=(20, 22),
+    ...                     parallaxes=False, separation=1.0, rng=1)
+    >>> images = [ImageEpoch(one.image, one.psf, one.wcs, one.time,
+    ...                      error=one.error)
+    ...           for one in simulate_epochs(
+    ...               sources, paper_exposures()[::3], rng=2,
+    ...               instrument=Instrument(shape=(200, 200)))]
+    >>> stars = PixelMotionFitter().fit(images, sources['ra', 'dec']).stars
+    >>> away = (stars['pmra'] - sources['pmra']) / stars['pmra_error']
+    >>> bool((abs(away) < 4).all())
+    True
+    """
+
+    def __init__(self, *, parallax=False, acceleration=False, references=None,
+                 fit_shape=11, fit_sky=True, forced=False, executor=None,
+                 progress_bar=False, flux='image'):
+        self.parallax = parallax
+        self.acceleration = acceleration
+        self.references = references
+        self.fit_shape = fit_shape
+        self.fit_sky = fit_sky
+        self.forced = forced
+        self.executor = executor
+        self.progress_bar = progress_bar
+        self.flux = flux
+        self._check()
+
+    def __repr__(self):
+        return (f'PixelMotionFitter(parallax={self.parallax!r}, '
+                f'acceleration={self.acceleration!r}, forced={self.forced!r})')
+
+    def fit(self, images, stars=None):
+        """
+        Fit stars to all images together.
+
+        Parameters
+        ----------
+        images : sequence of `ImageEpoch`
+            In any order, with any PSFs; their units are converted to that of
+            the first.
+        stars : `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
+            Where the stars are, to a pixel or so: ``ra`` and ``dec`` [deg],
+            at ``ref_epoch`` or else at the mean time of the images;
+            optionally ``id``, ``pmra``, ``pmdec`` and ``parallax``. By
+            default what `find` finds.
+
+        Returns
+        -------
+        `PixelMotionSolution`
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not valid.
+
+        Warns
+        -----
+        AstropyUserWarning
+            For each of the notes of the solution.
+        """
+        self._check()
+        if stars is None:
+            stars = self.find(images)
+        campaign = self._read(images, stars)
+        listed = read_stars(stars, campaign)
+        solution = self._solve(campaign, listed)
+        for sentence in solution.notes:
+            warnings.warn(sentence, AstropyUserWarning, stacklevel=2)
+        return solution
+
+    def find(self, images, stars=None, *, max_motion=None,
+             false_alarm=1e-5):
+        """
+        Look for stars in the evidence of all images together.
+
+        Parameters
+        ----------
+        images : sequence of `ImageEpoch`
+            As for `fit`; they lie on each other, to within their sizes.
+        stars : `~astropy.table.Table` or SkyCoord, optional
+            Stars that are known, to be fitted and subtracted first. They are
+            not in the result.
+        max_motion : `~astropy.units.Quantity`, optional
+            The largest motion along each axis that is searched; by default
+            that of 0.1 pixels an epoch. Time grows with its square.
+        false_alarm : float, optional
+            How often noise may be taken for a star, at each independent
+            place.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            ``id``, ``ra``, ``dec``, ``pmra``, ``pmdec``, the other columns
+            of a fit of the stars, and ``evidence``, the signal-to-noise
+            ratio of the search; what `fit` takes as ``stars``.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not valid, or images do not lie on each other.
+        """
+        self._check()
+        as_real(false_alarm, 'false_alarm', above=0, maximum=0.5)
+        if max_motion is not None:
+            max_motion = _as_motion(max_motion)
+        campaign = self._read(images, stars)
+        look = partial(candidates, campaign, max_motion,
+                       executor=self.executor)
+        known = ([] if stars is None else
+                 [self._solve(campaign, read_stars(stars, campaign))])
+        bright = look(_light(campaign, known), threshold=BRIGHT)
+        found = [self._found(campaign, bright)]
+        faint = look(_light(campaign, known + found),
+                     false_alarm=false_alarm)
+        every = vstack([bright, _apart(campaign, faint, bright)])
+        table = self._found(campaign, every).stars
+        table['evidence'] = every['evidence']
+        # What does not stay where it was found is no star.
+        return table[(table['flags'] & UNSURE) == 0]
+
+    def _found(self, campaign, table):
+        """Return the solution of stars found."""
+        fitter = copy(self)
+        fitter.references, fitter.forced = None, False
+        return fitter._solve(campaign, read_stars(table, campaign))
+
+    def _read(self, images, stars):
+        # Parallaxes of places that are given are part of them.
+        given = self.forced and 'parallax' in getattr(stars, 'colnames', ())
+        return read_campaign(images, flux=self.flux, fit_sky=self.fit_sky,
+                             parallax=self.parallax or given,
+                             acceleration=self.acceleration)
+
+    def _solve(self, campaign, listed):
+        """Return the solution of the stars listed."""
+        start = campaign.views(listed.values[:, None]).pixels
+        solved = solve(campaign, listed.values,
+                       as_shape(self.fit_shape, 'fit_shape'),
+                       forced=self.forced, executor=self.executor,
+                       progress_bar=self.progress_bar)
+        errors = errors_of(campaign, solved)
+        if campaign.estimated:
+            errors = _scaled(campaign, solved, errors)
+        if self.references is not None:
+            errors = replace(errors, covariance=errors.covariance
+                             + frame_covariance(self.references, campaign,
+                                                solved, errors.plain))
+        table = star_table(campaign, listed, solved, errors, start[:, :, 0],
+                           forced=self.forced, relative=self._is_relative())
+        images = image_table(campaign, solved, errors)
+        notes = campaign.notes + _coverage(campaign, solved)
+        if not self.forced:
+            notes += shift_notes(images)
+        return PixelMotionSolution(table, images, notes, campaign, listed,
+                                   solved, errors)
+
+    def _is_relative(self):
+        return (self.references is not None
+                and self.references._fit.setup.relative)
+
+    def _check(self):
+        as_choice(self.flux, 'flux', FLUXES)
+        as_shape(self.fit_shape, 'fit_shape')
+        for name in ('parallax', 'acceleration', 'fit_sky', 'forced',
+                     'progress_bar'):
+            if not isinstance(getattr(self, name), bool):
+                msg = (f'{name} must be True or False, got '
+                       f'{getattr(self, name)!r:.80}')
+                raise TypeError(msg)
+        if not isinstance(self.references, MotionSolution | None):
+            msg = ('references must be the MotionSolution that the WCS of the '
+                   f'images come from, got {type(self.references).__name__}')
+            raise TypeError(msg)
+        if self.executor is not None and not hasattr(self.executor, 'map'):
+            msg = ('executor must be a concurrent.futures.Executor, got '
+                   f'{self.executor!r:.80}')
+            raise TypeError(msg)
+
+
+def _light(campaign, solutions):
+    """Return x, y and flux (3, n) of solved stars in each image."""
+    out = []
+    for k in range(campaign.n_images):
+        parts = [np.zeros((3, 0))]
+        for one in solutions:
+            solved = one._solved
+            seen = solved.weights[:, k] > 0
+            parts.append(np.stack([*solved.pixels[seen, k].T,
+                                   solved.fluxes[seen, k]]))
+        out.append(np.concatenate(parts, axis=1))
+    return out
+
+
+def _apart(campaign, faint, bright):
+    """Return the faint candidates that are not what bright ones left over."""
+    if not (len(faint) and len(bright)):
+        return faint
+    places = [read_stars(one, campaign).values[:, :2]
+              for one in (faint, bright)]
+    pixel = np.sqrt(abs(np.linalg.det(Grid.of(campaign).matrix)))
+    radius = min(map(fwhm, campaign.epochs)) * pixel
+    away, _ = cKDTree(places[1]).query(places[0])
+    return faint[away > 0.7 * radius]
+
+
+def _as_motion(value):
+    """Return a motion in mas / yr, or raise."""
+    try:
+        value = u.Quantity(value, u.mas / u.yr)
+    except (TypeError, u.UnitConversionError) as error:
+        msg = (f'max_motion must be a Quantity like mas / yr, got '
+               f'{value!r:.80}')
+        raise TypeError(msg) from error
+    return as_real(float(value.value), 'max_motion', minimum=0)
+
+
+def _scaled(campaign, solved, errors):
+    """Return errors scaled by the scatter of residuals, star by star."""
+    chi2, dof = chi2_of(campaign, solved)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        scatter = np.where(dof > 0, chi2 / dof, np.nan)
+    return replace(errors, covariance=errors.covariance * scatter,
+                   flux_error=errors.flux_error * np.sqrt(scatter)[:, None])
+
+
+def _coverage(campaign, solved):
+    """Return sentences on stars that images do not show."""
+    seen = solved.weights > 0
+    if len(seen) and not seen.any():
+        return (NOBODY,)
+    if len(seen) and np.ptp(campaign.years) > 0 and not solved.enough.any():
+        return (NO_OVERLAP,)
+    return ()

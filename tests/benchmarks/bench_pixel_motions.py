@@ -1,0 +1,242 @@
+"""
+Motions from the pixels of all epochs beside those of catalogues.
+
+Run as ``python tests/benchmarks/bench_pixel_motions.py``. Parts: ``table``
+isolated stars of one signal-to-noise ratio an epoch in seven images at the
+times of Nie et al., frames known, from catalogues (single-epoch photometry of
+what is found at 5 sigma, at least three epochs) and from the pixels, against
+the Cramer-Rao bound by numeric derivatives; ``parallax`` stars of 1 mas in 20
+epochs; ``speed`` many stars, CPU seconds.
+
+A star counts as measured if it has a motion, no flag, and a significance of
+at least 5 in all images together. RMS and pulls are over all of these, none
+rejected.
+"""
+import argparse
+import time
+import warnings
+
+import astropy.units as u
+import numpy as np
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+from astropy.wcs import WCS
+
+from photutils_mgauss import (
+    Epoch,
+    GaussianMixture,
+    GriddedMixturePSF,
+    ImageEpoch,
+    MixturePSFPhotometry,
+    PixelMotionFitter,
+    ProperMotionFitter,
+    paper_exposures,
+    render_stars,
+)
+from photutils_mgauss.sky.observers import observer_position
+
+MIXTURE = GaussianMixture.from_stddevs(
+    [0.75, 0.25], [(0, 0), (0.05, 0)], [(0.85, 0.9), (1.9, 1.8)], [0.05, 0.1])
+PSF = GriddedMixturePSF([MIXTURE], [(0, 0)])
+NOISE, SCALE = 5.0, 74.0  # of a pixel; mas in one
+BOX, SPACING = 11, 29
+
+
+def make_wcs(angle, shift, size):
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = 'RA---TAN', 'DEC--TAN'
+    wcs.wcs.crval = 192.8595, 27.1283
+    wcs.wcs.crpix = np.array([size, size]) / 2 + shift
+    c, s = np.cos(angle) * SCALE / 3.6e6, np.sin(angle) * SCALE / 3.6e6
+    wcs.wcs.cd = [[-c, s], [s, c]]
+    return wcs
+
+
+class Sky:
+    """Stars on a lattice, seen in images at some years."""
+
+    def __init__(self, n_side, years, signal, rng, parallax=0.0):
+        self.rng, self.years, self.parallax = rng, np.asarray(years), parallax
+        self.size = SPACING * (n_side + 1)
+        self.wcs = [make_wcs(rng.normal(0, 0.002), rng.normal(0, 2, 2),
+                             self.size) for _ in years]
+        grid = SPACING * np.arange(1, n_side + 1.0)
+        x, y = (axis.ravel() + rng.uniform(-0.5, 0.5, axis.size)
+                for axis in np.meshgrid(grid, grid))
+        self.start = make_wcs(0, 0, self.size).pixel_to_world(x, y)
+        self.motion = rng.normal(0, 5, (2, x.size))  # mas / yr
+        stamp = MIXTURE.render((41, 41), 20, 20)
+        self.flux = signal * NOISE / np.sqrt(np.sum(stamp**2))
+        self.mean = self.years.mean()
+
+    def factors(self):
+        """Return parallax factors east and north (E, n)."""
+        ra, dec = self.start.ra.rad, self.start.dec.rad
+        x, y, z = observer_position(None, self.years)[:, :, None]
+        return (x * np.sin(ra) - y * np.cos(ra),
+                (x * np.cos(ra) + y * np.sin(ra)) * np.sin(dec)
+                - z * np.cos(dec))
+
+    def places(self, k):
+        dt = self.years[k] - self.mean
+        east, north = (self.motion[i] * dt + self.parallax * factor[k]
+                       for i, factor in enumerate(self.factors()))
+        return self.start.spherical_offsets_by(east * u.mas, north * u.mas)
+
+    def images(self):
+        shape, out = (self.size, self.size), []
+        for k, wcs in enumerate(self.wcs):
+            x, y = wcs.world_to_pixel(self.places(k))
+            light = render_stars(PSF, x, y, np.full(x.size, self.flux), shape)
+            data = light + 100 + self.rng.normal(0, NOISE, shape)
+            out.append(ImageEpoch(data, PSF, wcs, self.years[k], error=NOISE))
+        return out
+
+    def known(self):
+        """Return the stars a third of a pixel off, at rest."""
+        east, north = self.rng.normal(0, 0.3 * SCALE, (2, len(self.start)))
+        return SkyCoord(self.start.spherical_offsets_by(
+            east * u.mas, north * u.mas))
+
+    def bound(self):
+        """Return errors (4 or 5,) of place, motion and parallax [mas]."""
+        fisher = SCALE**-2 * mean_fisher(self.flux)
+        east, north = (factor.mean(axis=1) for factor in self.factors())
+        total = 0.0
+        for dt, *pair in zip(self.years - self.mean, east, north,
+                             strict=True):
+            d = np.zeros((2, 5 if self.parallax else 4))
+            d[0, 0] = d[1, 1] = 1
+            d[0, 2] = d[1, 3] = dt
+            if self.parallax:
+                d[:, 4] = pair
+            total = total + d.T @ fisher @ d
+        return np.sqrt(np.diag(np.linalg.inv(total)))
+
+
+def mean_fisher(flux, step=1e-3):
+    """Return the matrix (2, 2) of x and y, flux and sky eliminated."""
+    total = []
+    for dx, dy in np.random.default_rng(1).uniform(-0.5, 0.5, (40, 2)):
+        def draw(x, y):
+            return MIXTURE.render((BOX, BOX), 5 + x, 5 + y).ravel()
+        rows = np.stack([
+            flux * (draw(dx + step, dy) - draw(dx - step, dy)) / (2 * step),
+            flux * (draw(dx, dy + step) - draw(dx, dy - step)) / (2 * step),
+            draw(dx, dy), np.ones(BOX * BOX)]) / NOISE
+        cross = rows @ rows.T
+        total.append(cross[:2, :2] - cross[:2, 2:] @ np.linalg.solve(
+            cross[2:, 2:], cross[2:, :2]))
+    return np.mean(total, axis=0)
+
+
+def score(names, table, truth, bound, measured):
+    """Return measured share, RMS/bound and pull."""
+    away = np.array([(table[name] - true).value
+                     for name, true in zip(names, truth, strict=True)])
+    error = np.array([table[f'{name}_error'].value for name in names])
+    away, error = away[:, measured], error[:, measured]
+    scaled = away / bound[:, None]
+    return (measured.mean(), np.sqrt(np.mean(scaled**2)),
+            np.sqrt(np.mean((away / error)**2)))
+
+
+def from_pixels(sky, images, **options):
+    stars = PixelMotionFitter(parallax=bool(sky.parallax), **options).fit(
+        images, sky.known()).stars
+    return stars, ((stars['flags'] == 0) & (stars['significance'] >= 5)
+                   & np.isfinite(stars['pmra']))
+
+
+def from_catalogues(sky, images):
+    """Return motions of stars found at 5 sigma in at least three images."""
+    phot, tables = MixturePSFPhotometry(PSF, BOX), []
+    for k, image in enumerate(images):
+        x, y = sky.wcs[k].world_to_pixel(sky.places(k))
+        table = phot(np.asarray(image.data) - 100, error=np.full(
+            image.data.shape, NOISE), init_params=QTable(
+                {'x': x, 'y': y, 'flux': np.full(x.size, sky.flux)}))
+        table['id'] = np.arange(len(table))
+        found = table['flux_fit'] > 5 * table['flux_err']
+        found &= np.hypot(table['x_fit'] - x, table['y_fit'] - y) < 2
+        tables.append(Epoch(table[found], sky.wcs[k], sky.years[k]))
+    empty = QTable({'pmra': np.full(len(sky.start), np.nan) * u.mas / u.yr})
+    for name in ('pmdec', 'pmra_error', 'pmdec_error'):
+        empty[name] = empty['pmra'].copy()
+    try:
+        got = ProperMotionFitter(transform=None, match_by='id', clip=None,
+                                 systematic=None).fit(tables).stars
+    except ValueError:  # nothing has been found
+        return empty, np.zeros(len(empty), bool)
+    for name in empty.colnames:
+        empty[name][np.asarray(got['id'])] = got[name]
+    count = np.zeros(len(empty), int)
+    count[np.asarray(got['id'])] = got['n_good_obs']
+    return empty, (count >= 3) & np.isfinite(empty['pmra'].value)
+
+
+def print_table(options):
+    years = [exposure.time.jyear for exposure in paper_exposures()]
+    print('S/N   catalogues: measured RMS/bound pull   pixels: measured '
+          'RMS/bound pull   flux bias')
+    for signal in options.signals:
+        sky = Sky(options.side, years, signal,
+                  np.random.default_rng([options.seed, int(10 * signal)]))
+        images, bound = sky.images(), sky.bound()[2:4]
+        words = f'{signal:4.1f}'
+        got = {}
+        for name, make in (('catalogues', from_catalogues),
+                           ('pixels', from_pixels)):
+            stars, measured = make(sky, images)
+            got[name] = stars
+            values = ((0.0, np.nan, np.nan) if not measured.any() else
+                      score(('pmra', 'pmdec'), stars,
+                            sky.motion * u.mas / u.yr, bound, measured))
+            words += '      {:6.1%} {:6.3f} {:6.3f}'.format(*values)
+        bias = np.nanmean(got['pixels']['flux'].value) / sky.flux - 1
+        print(words + f'      {bias:+.3f}', flush=True)
+
+
+def print_parallax(options):
+    years = 2024.0 + np.arange(20) * 0.23
+    for signal in (3, 5, 10):
+        sky = Sky(options.side, years, signal,
+                  np.random.default_rng([options.seed, signal]), parallax=1.0)
+        stars, measured = from_pixels(sky, sky.images())
+        values = score(('parallax',), stars, [1 * u.mas], sky.bound()[4:],
+                       measured)
+        mean = np.mean(stars['parallax'][measured].value)
+        print('parallax, S/N {:4.1f}: {:6.1%} {:6.3f} {:6.3f}, mean {:.3f} '
+              'mas'.format(signal, *values, mean), flush=True)
+
+
+def print_speed(options):
+    years = [exposure.time.jyear for exposure in paper_exposures()]
+    sky = Sky(options.speed_side, years, 10.0, np.random.default_rng(1))
+    images, stars = sky.images(), sky.known()
+    PixelMotionFitter().fit(images, stars[:50])
+    start, wall = time.process_time(), time.perf_counter()
+    PixelMotionFitter().fit(images, stars)
+    print(f'{len(stars)} stars x {len(images)} images of {BOX} x {BOX}: '
+          f'{time.process_time() - start:.1f} s CPU, '
+          f'{time.perf_counter() - wall:.1f} s')
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
+    parser.add_argument('parts', nargs='*',
+                        default=['table', 'parallax', 'speed'])
+    parser.add_argument('--side', type=int, default=30)
+    parser.add_argument('--speed-side', type=int, default=100)
+    parser.add_argument('--seed', type=int, default=7)
+    parser.add_argument('--signals', type=float, nargs='+',
+                        default=[2.5, 3, 4, 5, 7, 10])
+    options = parser.parse_args()
+    warnings.simplefilter('ignore')
+    for part in options.parts:
+        {'table': print_table, 'parallax': print_parallax,
+         'speed': print_speed}[part](options)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,92 @@
+"""The command that measures motions in the pixels of all images."""
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+
+from photutils_mgauss import (
+    Instrument,
+    paper_exposures,
+    simulate_epochs,
+    sky_field,
+)
+from photutils_mgauss.cli import main
+from photutils_mgauss.cli.psf_files import write_psf
+
+NIGHTS = ('night1', 'night2', 'night3')
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    """Write three exposures, their PSFs and their stars."""
+    out = tmp_path_factory.mktemp('pixels')
+    sources = sky_field(12, 4, size=0.15, magnitudes=(21, 23),
+                        parallaxes=False, separation=1.0, rng=5)
+    scenes = simulate_epochs(sources, paper_exposures()[1::2], rng=6,
+                             instrument=Instrument(shape=(200, 200)))
+    for name, scene in zip(NIGHTS, scenes, strict=True):
+        scene.write(out / f'{name}.fits')
+        write_psf(scene.psf, out / f'{name}_psf.fits', {})
+    sources.write(out / 'truth.ecsv')
+    return out
+
+
+def run(folder, *more):
+    return main(['motions', '--pixels',
+                 *(str(folder / f'{name}.fits') for name in NIGHTS),
+                 '--psf', *(str(folder / f'{name}_psf.fits')
+                            for name in NIGHTS),
+                 '--wcs', *(str(folder / f'{name}_wcs.asdf')
+                            for name in NIGHTS), *map(str, more)])
+
+
+def test_images_become_motions_and_light_curves(folder):
+    out = folder / 'deep'
+    assert run(folder, '--output', out) in (0, None)
+    stars, true = (QTable.read(path) for path in (
+        out / 'motions.ecsv', folder / 'truth.ecsv'))
+    index, away, _ = SkyCoord(stars['ra'], stars['dec']).match_to_catalog_sky(
+        SkyCoord(true['ra'], true['dec']))
+    near = away.arcsec < 0.1
+    assert len(np.unique(index[near])) >= 15
+    pull = ((stars['pmra'] - true['pmra'][index]) / stars['pmra_error'])[near]
+    assert np.abs(pull).max() < 4.5
+    curves = QTable.read(out / 'light_curves.ecsv')
+    assert len(curves) == stars['n_images'].sum()
+    assert len(QTable.read(out / 'images.ecsv')) == 3
+
+
+def test_places_given_are_kept_and_results_too(folder):
+    out, kept = folder / 'forced', folder / 'kept'
+    options = ('--targets', folder / 'truth.ecsv', '--forced', '--output',
+               out, '--checkpoint', kept)
+    assert run(folder, *options) in (0, None)
+    stars, true = (QTable.read(path) for path in (
+        out / 'motions.ecsv', folder / 'truth.ecsv'))
+    assert np.abs((stars['pmra'] - true['pmra']).value).max() < 1e-5
+    before = {path: path.stat().st_mtime_ns for path in kept.iterdir()}
+    assert run(folder, *options) in (0, None)
+    assert before == {path: path.stat().st_mtime_ns for path in
+                      kept.iterdir()}
+
+
+@pytest.mark.parametrize(('options', 'words'), [
+    (['--forced'], '--targets'), (['--frames', 'nowhere'], '--frames'),
+    (['--plane'], '--plane'), (['--targets', 'nowhere.ecsv'], 'nowhere')])
+def test_wrong_options_are_told(folder, options, words, capsys):
+    try:
+        code = run(folder, '--output', folder / 'wrong', *options)
+    except SystemExit as stop:
+        code = stop.code
+    assert code not in (0, None)
+    assert words in capsys.readouterr().err
+    assert not (folder / 'wrong').exists()
+
+
+def test_options_of_pixels_alone_are_told(folder, capsys):
+    try:
+        code = main(['motions', str(folder / 'night1.fits'), '--psf', 'x'])
+    except SystemExit as stop:
+        code = stop.code
+    assert code not in (0, None)
+    assert '--pixels' in capsys.readouterr().err
