@@ -193,8 +193,9 @@ class Model:
         """Find again the diffuse light that stars and sky leave over."""
         if self.options.background_size:
             before = self.background()
-            self.level = self.level + self.diffuse.update(
-                self.residual, self.weight, self.mesh, self.noise)
+            self.level = np.clip(self.level + self.diffuse.update(
+                self.residual, self.weight, self.mesh, self.noise),
+                *self.limits)
             self.residual += before - self.background()
 
     def star_light(self):
