@@ -38,10 +38,11 @@ def add_fit(parser):
     group = parser.add_argument_group('the fit')
     group.add_argument('--n-components', type=tools.number_or_auto,
                        metavar='K', help='number of Gaussians, or auto, '
-                       'which tries (default: 6 for images, 3 for PSF files)')
+                       'which tries (default: 6 for images, auto with 8 to '
+                       '59 stars; 3 for PSF files)')
     group.add_argument('--degree', type=tools.number_or_auto, metavar='D',
                        help='degree of the polynomials over the detector, or '
-                            'auto (default: 4, lowered for few stars)')
+                            'auto (default: 4, auto with 8 to 59 stars)')
     group.add_argument('--radius', type=tools.positive, metavar='PIXELS',
                        help='radius of the stamps (default: 10 for images)')
     group.add_argument('--min-snr', type=tools.positive, default=50,

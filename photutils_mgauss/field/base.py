@@ -59,8 +59,8 @@ class Field(ComparedByValue):
         Return the factor from the flux in an aperture to that of the PSF.
 
         Beyond ``self.radius`` the wings are those of the Gaussians, which no
-        pixel has confirmed: to tie fluxes to a larger aperture, compare the
-        two with bright stars.
+        pixel has confirmed, unless the field was fitted with
+        ``normalise='curve-of-growth'``.
 
         Parameters
         ----------

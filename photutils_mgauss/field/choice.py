@@ -1,15 +1,48 @@
-"""Choice of degree and number of Gaussians by stars left out of the fit."""
+"""
+Choice of degree and number of Gaussians by stars left out of the fit.
+
+Candidates are fitted to all stars. From there each part of the stars in turn
+is left out, the shapes are fitted to the others, and what they say of those
+left out, whose positions and fluxes are fitted, is the score.
+"""
 import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss.field import stages
-from photutils_mgauss.field.normal import equations
+from photutils_mgauss.field.normal import equations, optimise
 
-N_FOLDS = 3
 DEGREES = (0, 1, 2, 3, 4, 5)
 COMPONENTS = (2, 3, 4, 5, 6, 7)
-# While the number of Gaussians is chosen, the degree is at most this.
-_DEGREE_FOR_COMPONENTS = 3
+# What is taken without a choice, and from how few to how many stars there is
+# one by default: below there is nobody to ask, above it changes little.
+_USUAL_COMPONENTS, _USUAL_DEGREE = 6, 4
+_FEWEST_STARS, _MANY_STARS = 8, 60
+# The prior becomes stronger as long as that helps.
+_STRENGTHS = (1.0, 4.0, 16.0)
+# While the number of Gaussians is chosen, the degree is at most this, and the
+# brightest stars decide.
+_DEGREE_FOR_COMPONENTS, _STARS_FOR_COMPONENTS = 2, 100
+_FIRST_COMPONENTS = 5
+# The fit without some stars starts where the one with all of them ended. It
+# must forget them: no damping.
+_FOLD_STEPS, _FOLD_TOLERANCE, _FOLD_DAMPING = 4, 0.1, 1e-7
+# A higher degree than the usual one is tried if the last step up has gained
+# more than so many standard deviations.
+_CLEAR_GAIN = 3.0
+
+
+def n_folds(n_stars):
+    """Return into how many parts the stars are divided."""
+    # Few stars are left out in smaller parts.
+    return 3 if n_stars >= _MANY_STARS else 5
+
+
+def by_default(n_components, degree, n_stars):
+    """Replace None by 'auto' where few stars have to decide."""
+    few = _FEWEST_STARS <= n_stars < _MANY_STARS
+    usual = ('auto', 'auto') if few else (_USUAL_COMPONENTS, _USUAL_DEGREE)
+    return (usual[0] if n_components is None else n_components,
+            usual[1] if degree is None else degree)
 
 
 def choose(problem, n_components, degree, max_degree, strength, workers):
@@ -23,70 +56,125 @@ def choose(problem, n_components, degree, max_degree, strength, workers):
     n_components, degree : int or 'auto'
     max_degree : int
         The highest degree that the number of stars allows.
-    strength : float
-        Of the prior.
+    strength : float or None
+        Of the prior. None is 1, or what is best if the number of Gaussians
+        is chosen for few stars.
     workers : Workers
 
     Returns
     -------
-    int, int, `~astropy.table.QTable`
-        Number of Gaussians, degree, and the chi^2 per pixel of left-out
-        stars for each pair that was tried.
+    int, int, float, `~astropy.table.QTable`
+        Number of Gaussians, degree, strength, and the chi^2 per pixel of
+        left-out stars for each set that was tried.
     """
-    tried = QTable(names=('n_components', 'degree', 'reduced_chi2'),
-                   dtype=(int, int, float))
+    tried = QTable(names=('n_components', 'degree', 'regularization',
+                          'reduced_chi2'), dtype=(int, int, float, float))
+    top = min(_DEGREE_FOR_COMPONENTS,
+              max_degree if degree == 'auto' else degree)
+    few = _brightest(problem, _STARS_FOR_COMPONENTS)
+    strong = 1.0 if strength is None else strength
+
+    def score(number, strength):
+        return _score(few, number, top, strength, workers, tried)
     if n_components == 'auto':
-        top = (min(_DEGREE_FOR_COMPONENTS, max_degree) if degree == 'auto'
-               else degree)
-        scores = {k: _try(problem, k, top, strength, workers, tried)[top]
-                  for k in COMPONENTS}
-        n_components = min(scores, key=scores.get)
+        n_components, found = _climb(
+            lambda k: score(k, strong), _FIRST_COMPONENTS, COMPONENTS)
+        if strength is None and len(problem.basis) < _MANY_STARS:
+            strong = _climb(lambda s: found if s == 1 else score(
+                n_components, s), 1.0, _STRENGTHS)[0]
     if degree == 'auto':
-        scores = _try(problem, n_components, max_degree, strength, workers,
-                      tried)
-        degree = min(scores, key=scores.get)
-    return n_components, degree, tried
+        degree = _best_degree(problem, n_components, max_degree, strong,
+                              workers, tried)
+    return n_components, degree, strong, tried
 
 
-def _try(problem, n_components, top, strength, workers, tried):
-    """Return the score of each degree up to the top one; note them."""
-    chi2 = np.full((top + 1, len(problem.basis)), np.nan)
-    for fold in range(N_FOLDS):
-        out = np.arange(len(problem.basis)) % N_FOLDS == fold
-        chi2[:, out] = _left_out(problem, out, n_components, top, strength,
-                                 workers)
-    # Stars that no degree describes say nothing about which is best.
-    best = np.nanmin(chi2, axis=0)
-    fair = stages.not_deviant(best, np.ones(best.size, bool))
-    scores = dict(enumerate(chi2[:, fair].mean(axis=1)))
-    for degree, score in scores.items():
-        tried.add_row((n_components, degree, score))
-    return scores
+def _brightest(problem, n_stars):
+    order = np.argsort(-problem.sources[:, 0, 2])
+    return problem.subset(np.sort(order[:n_stars]))
 
 
-def _left_out(problem, out, n_components, top, strength, workers):
-    """Return the reduced chi^2 of left-out stars for each degree."""
-    inside, outside = (problem.subset(np.flatnonzero(rows))
-                       for rows in (~out, out))
-    outside.used = np.zeros(len(outside.basis), bool)
-    stamps = outside.stamps
+def _climb(score, first, steps):
+    """Return the step next to which none is better, and its scores."""
+    place = steps.index(first)
+    lowest = score(first)
+    for way in (1, -1):
+        start = place
+        while 0 <= place + way < len(steps):
+            new = score(steps[place + way])
+            # A star that one of the two describes is a fair one.
+            before, after = _mean(np.array([lowest, new]))
+            if after >= before:
+                break
+            place, lowest = place + way, new
+        if place != start:
+            break
+    return steps[place], lowest
+
+
+def _score(problem, n_components, top, strength, workers, tried):
+    """Return the chi^2 of each star for a number of Gaussians."""
+    *_, last = stages.degrees(problem, n_components, top, strength, workers)
+    chi2 = _left_out(last, workers)
+    tried.add_row((n_components, top, strength, _mean(chi2[None])[0]))
+    return chi2
+
+
+def _best_degree(problem, n_components, top, strength, workers, tried):
+    """Return the degree of the lowest score."""
+    found = []
+    for degree, fit in enumerate(stages.degrees(
+            problem, n_components, top, strength, workers)):
+        if degree > _USUAL_DEGREE and not _clear(*found[-2:]):
+            break
+        found.append(_left_out(fit, workers))
+    scores = _mean(np.array(found))
+    for degree, score in enumerate(scores):
+        tried.add_row((n_components, degree, strength, score))
+    return int(np.argmin(scores))
+
+
+def _clear(before, after):
+    """Return whether the chi^2 of the stars has clearly become lower."""
+    gain = (before - after)[_fair(np.array([before, after]))]
+    error = gain.std() / np.sqrt(max(gain.size, 1))
+    return gain.mean() > _CLEAR_GAIN * error
+
+
+def _mean(chi2):
+    """Return the score of each candidate from its stars' (m, n)."""
+    return chi2[:, _fair(chi2)].mean(axis=1)
+
+
+def _fair(chi2):
+    """Return which stars some candidate describes."""
+    best = chi2.min(axis=0)
+    return stages.not_deviant(best, np.ones(best.size, bool))
+
+
+def _left_out(fit, workers):
+    """Return the reduced chi^2 of every star when it is left out."""
+    n = len(fit.problem.basis)
+    folds = np.arange(n) % n_folds(n)
+    chi2 = np.empty(n)
+    for fold in np.unique(folds):
+        inside, outside = (fit.problem.subset(np.flatnonzero(rows))
+                           for rows in (folds != fold, folds == fold))
+        coefficients, _ = optimise(
+            inside, fit.coefficients, fit.prior, workers,
+            max_steps=_FOLD_STEPS, tolerance=_FOLD_TOLERANCE,
+            damping=_FOLD_DAMPING)
+        chi2[folds == fold] = _settled(outside, coefficients, workers)
+    return chi2
+
+
+def _settled(problem, coefficients, workers):
+    """Return the reduced chi^2 of stars whose own numbers are fitted."""
+    stamps = problem.stamps
+    problem.used = np.zeros(len(problem.basis), bool)
     # One variance for all candidates, not that of each one's model.
     variance = stamps.base + stamps.slope * np.maximum(stamps.data, 0)
-    outside.weights = np.where(stamps.good, 1 / variance, 0)
-    n_pixels = stamps.good.sum(axis=(1, 2))
-    return [_settled(outside, coefficients, blurs, workers) / n_pixels
-            for coefficients, blurs in stages.degrees(
-                inside, n_components, top, strength, workers)]
-
-
-def _settled(problem, coefficients, blurs, workers):
-    """Return chi^2 of stars whose own numbers are fitted."""
-    now = problem.subset(np.arange(len(problem.basis)))
-    # The last exposures may have no star inside.
-    now.local = np.pad(blurs, ((0, now.exposure.max() + 1), (0, 0)))[
-        now.exposure]
-    now.basis = np.ascontiguousarray(now.basis[:, :len(coefficients)])
+    problem.weights = np.where(stamps.good, 1 / variance, 0)
     for _ in range(3):
-        state = equations(now, coefficients, workers)
-        now.sources, now.sky = state.sources, state.sky
-    return state.chi2
+        state = equations(problem, coefficients, workers)
+        problem.sources, problem.sky = state.sources, state.sky
+    return state.chi2 / stamps.good.sum(axis=(1, 2))

@@ -35,7 +35,7 @@ _PRIOR_STDDEV = 0.03
 _PRIOR_FALL = 0.5
 # Steps towards the centre of the core: a moment under the weight, narrower
 # than the PSF and the weight, is about so much less than the offset.
-_CENTRE_STEPS, _CENTRE_GAIN = 4, 1.2
+_CENTRE_STEPS, _CENTRE_GAIN = 4, 1.1
 
 
 @dataclass(frozen=True, eq=False, repr=False)

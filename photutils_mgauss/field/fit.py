@@ -4,10 +4,12 @@ The fit of a PSF field to the pixels of the stars of one or more images.
 Input is read and checked here, `photutils_mgauss.field.stages` does the
 fitting, and what it found becomes the public results.
 """
+import warnings
 from dataclasses import replace
 
 import numpy as np
 from astropy.table import QTable
+from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import (
@@ -15,12 +17,18 @@ from photutils_mgauss.field.base import (
     residual_stars,
     star_table,
 )
-from photutils_mgauss.field.choice import choose
+from photutils_mgauss.field.choice import by_default, choose
 from photutils_mgauss.field.covariance import honest_covariance
 from photutils_mgauss.field.forms import TunedShapes
+from photutils_mgauss.field.growth import (
+    FIRST_RADIUS,
+    measure_wings,
+    own_radius,
+)
 from photutils_mgauss.field.input import (
     allow_for_correlation,
     possible_degree,
+    read_exposures,
     read_sample,
 )
 from photutils_mgauss.field.mixture_field import MixtureField
@@ -31,15 +39,19 @@ from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 
 __all__ = ['fit_mixture_field']
 
-# The degrees of the polynomials without and with a PSF to start from.
-_DEGREE, _TUNED_DEGREE = 4, 1
+# The degree of the polynomials with a PSF to start from.
+_TUNED_DEGREE = 1
+# The weight of the centre in widths of the core, and at most in radii of the
+# stamp. A narrower one follows aberrations in a way that no distortion of low
+# degree can describe, a wider one sees more noise.
+_CENTRE_SIZE, _CENTRE_SHARE = 2.0, 0.36
 
 
-def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
-                      degree=None, radius=10, local_bkg=False,
-                      effective_gain=None, reject=True, regularization=1.0,
-                      start=None, centre='core', pixel_integrated='auto',
-                      correlated_noise=True,
+def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
+                      degree=None, radius=None, local_bkg=False,
+                      effective_gain=None, reject=True, regularization=None,
+                      start=None, centre='core', normalise='stamps',
+                      pixel_integrated='auto', correlated_noise=True,
                       executor=None):
     """
     Fit a PSF field to the pixels of stars.
@@ -71,16 +83,20 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
         too; pixels that are not finite, or whose error is not positive, are
         left out as well.
     n_components : int or 'auto', optional
-        The number K of Gaussians; 'auto' tries 2 to 7 and keeps the number
-        that describes stars left out of the fit best.
+        The number K of Gaussians; 'auto' climbs between 2 and 7 to the number
+        that describes stars left out of the fit best. By default it is 6, or
+        'auto' with 8 to 59 stars.
     degree : int or 'auto', optional
         The degree of the polynomials, 0 for a PSF that is the same
-        everywhere; by default 4, or 1 with ``start``. It is lowered, with a
-        warning, if there are too few stars. 'auto' tries 0 to 5 in the same
-        way. Terms that the stars do not ask for are shrunk, so that a degree
-        that is too high costs time more than accuracy.
+        everywhere; by default 4, or 'auto' with 8 to 59 stars, or 1 with
+        ``start``. It is lowered, with a warning, if there are too few stars.
+        'auto' tries degrees from 0 to 5 in the same way. Terms that the stars
+        do not ask for are shrunk, so that a degree that is too high costs
+        time more than accuracy.
     radius : float, optional
-        The radius of the circle of pixels that is fitted [pix].
+        The radius of the circle of pixels that is fitted [pix]. By default
+        four times the width at half maximum of the stars, but at least 10
+        and at most 20.
     local_bkg : bool, optional
         Whether to fit a constant background to each star's stamp.
     effective_gain : float, optional
@@ -92,9 +108,10 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
     reject : bool, optional
         Whether to drop deviant stars and pixels.
     regularization : float, optional
-        The strength of the prior on the shapes, 1 for the default. It keeps
-        Gaussians apart that the stars cannot tell from each other. How much
-        the shapes vary over the field is learnt from the stars.
+        The strength of the prior on the shapes. It keeps Gaussians apart that
+        the stars cannot tell from each other. How much the shapes vary over
+        the field is learnt from the stars. By default 1, or, where few stars
+        choose the number of Gaussians, 1, 4 or 16 as they choose.
     start : GriddedMixturePSF, optional
         A PSF that is known already, as from an archive, or anything with a
         method ``mixture_at``. Only what the stars can tell of it is fitted:
@@ -104,10 +121,17 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
     centre : {'core', 'flux'}, optional
         What is at the origin of the PSF, which is where positions of stars
         are: the point about which the first moment vanishes under a Gaussian
-        weight as large as the core of the PSF, its standard deviation the
-        full width at half maximum in the middle of the detector; or the flux
-        centroid, which wanders from image to image with the noise of the
-        wings. With ``start`` it stays where that of ``start`` is.
+        weight larger than the core of the PSF, its standard deviation twice
+        the full width at half maximum in the middle of the detector, if the
+        stamps are large enough for that; or the flux centroid, which wanders
+        from image to image with the noise of the wings. With ``start`` it
+        stays where that of ``start`` is.
+    normalise : {'stamps', 'curve-of-growth'}, optional
+        What is all the flux of a star: that of the Gaussians, as the pixels
+        of the stamps continue them; or with what the stars show in rings
+        beyond their stamps, up to three radii, and as the power law of the
+        outer rings goes on. The light beyond is added as one wide Gaussian.
+        Not with ``start``.
     pixel_integrated : 'auto' or bool, optional
         Whether the Gaussians are those of the optics, integrated over each
         pixel, or those of the PSF in pixels, sampled at the middle of each.
@@ -147,46 +171,103 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=6,
     array([[2. , 0.3],
            [0.3, 1.5]])
     """
-    if degree is None:
-        degree = _DEGREE if start is None else _TUNED_DEGREE
     n_components = _number(n_components, 'n_components', 1)
     degree = _number(degree, 'degree', 0)
-    radius = as_real(radius, 'radius', minimum=2)
-    options = {'strength': as_real(regularization, 'regularization', above=0),
-               'reject': reject}
+    if radius is not None:
+        radius = as_real(radius, 'radius', minimum=2)
+    if regularization is not None:
+        regularization = as_real(regularization, 'regularization', above=0)
     as_choice(centre, 'centre', ('core', 'flux'))
+    as_choice(normalise, 'normalise', ('stamps', 'curve-of-growth'))
+    if start is not None and normalise != 'stamps':
+        msg = ("normalise must be 'stamps' with start, whose wings are known "
+               f'already, got {normalise!r}')
+        raise ValueError(msg)
     pixel_integrated = _pixel_integrated(pixel_integrated, start)
-    sample = read_sample(data, stars, error, mask, radius, effective_gain)
+    sample, radius = _read(data, stars, error, mask, radius, effective_gain)
     if correlated_noise:
         allow_for_correlation(sample)
+    if start is not None and degree is None:
+        degree = _TUNED_DEGREE
+    n_components, degree = by_default(n_components, degree, len(sample.row))
     top = possible_degree(degree, len(sample.row))
     problem = sample.problem(top, local_bkg)
     with Workers(executor) as workers:
         if start is not None:
             problem.pixel_integrated = pixel_integrated
-            fit = stages.tune(_known(problem, sample, start), top, workers,
-                              **options)
+            fit = stages.tune(
+                _known(problem, sample, start), top, workers, reject=reject,
+                strength=regularization or 1.0)
             return _tuned(fit, sample, start, radius, centre)
         problem.pixel_integrated = chosen_pixel(
-            problem, pixel_integrated, options['strength'], workers)
+            problem, pixel_integrated, regularization or 1.0, workers)
         fit, choice = _free(problem, n_components, degree, top, workers,
-                            options)
-    return _result(fit, sample, radius, choice, centre)
+                            regularization, reject)
+    field = _result(fit, sample, radius, choice, centre)
+    if normalise == 'stamps':
+        return field
+    return _with_wings(field, sample, read_exposures(data, stars, error,
+                                                     mask))
 
 
-def _free(problem, n_components, degree, top, workers, options):
+def _read(data, stars, error, mask, radius, gain):
+    """Return the sample and the radius of its stamps."""
+    if radius is not None:
+        return read_sample(data, stars, error, mask, radius, gain), radius
+    sample = read_sample(data, stars, error, mask, FIRST_RADIUS, gain)
+    radius = own_radius(sample.stamps)
+    if radius != FIRST_RADIUS:
+        sample = read_sample(data, stars, error, mask, radius, gain)
+    return sample, radius
+
+
+def _with_wings(field, sample, exposures):
+    """Return the field with the light beyond the stamps."""
+    table = field.stars[field.stars['used']]
+    flux = np.asarray(table['flux_fit'].value if hasattr(
+        table['flux_fit'], 'unit') else table['flux_fit'])
+    exposure = (table['exposure'] if 'exposure' in table.colnames
+                else np.zeros(len(table), int))
+    stars = np.column_stack([table['x_fit'], table['y_fit'], flux])
+    pixels = [one for one, _ in exposures]
+    wings = measure_wings(
+        pixels, sample.catalogues,
+        [stars[exposure == i] for i in range(len(pixels))],
+        field.enclosed_flux(*_middle(sample)) + _left(field, flux),
+        field.radius)
+    if wings.share == 0:
+        warnings.warn(
+            "normalise='curve-of-growth' found no light beyond the "
+            f'stamps, {wings.error:.4f} of the flux at most; nothing was '
+            'added', AstropyUserWarning, stacklevel=3)
+    new = field.stars.copy()
+    new['flux_fit'] = new['flux_fit'] / (1 - wings.share)
+    return replace(field, stars=new, wing_share=wings.share,
+                   wing_stddev=wings.stddev, wing_error=wings.error)
+
+
+def _left(field, flux):
+    """Return the light the Gaussians leave in the stamps, over the flux."""
+    residual = field.residual_stars[np.asarray(field.stars['used'])]
+    # Deviant pixels count as what they would be without.
+    light = np.nanmean(residual, axis=(1, 2)) * np.count_nonzero(
+        np.isfinite(residual).any(axis=0))
+    return np.sum(flux * light) / np.sum(flux**2)
+
+
+def _free(problem, n_components, degree, top, workers, strength, reject):
     """Return the fit, and the table of what was tried for it."""
-    n_components, degree, choice = choose(
+    n_components, degree, strength, choice = choose(
         problem, n_components, degree if degree == 'auto' else top, top,
-        options['strength'], workers)
+        strength, workers)
     problem.basis = np.ascontiguousarray(
         problem.basis[:, :stages.n_terms(degree)])
-    return (stages.run(problem, n_components, degree, workers, **options),
-            choice)
+    return stages.run(problem, n_components, degree, workers,
+                      strength=strength, reject=reject), choice
 
 
 def _number(value, name, minimum):
-    if isinstance(value, str) and value == 'auto':
+    if value is None or (isinstance(value, str) and value == 'auto'):
         return value
     return as_integer(value, name, minimum=minimum)
 
@@ -219,7 +300,7 @@ def _known(problem, sample, start):
 
 def _tuned(fit, sample, start, radius, centre):
     sample = sample.without_deviant(fit.problem.used)
-    stddev = _centre_stddev(start.mixture_at(*_middle(sample)), centre,
+    stddev = _centre_stddev(start.mixture_at(*_middle(sample)), radius, centre,
                             bool(getattr(start, 'pixel_integrated', False)))
     covariance, unmodelled = honest_covariance(fit)
     return TunedMixtureField(
@@ -239,7 +320,7 @@ def _result(fit, sample, radius, choice, centre):
     middle = field.mixture_at(*_middle(sample))
     if not field.pixel_integrated:
         warn_of_phase(middle)
-    stddev = _centre_stddev(middle, centre, field.pixel_integrated)
+    stddev = _centre_stddev(middle, radius, centre, field.pixel_integrated)
     return replace(field, stars=star_table(fit, sample, stddev),
                    centre_stddev=stddev)
 
@@ -249,13 +330,14 @@ def _middle(sample):
     return [(n - 1) / 2 for n in sample.shape[::-1]]
 
 
-def _centre_stddev(mixture, centre, integrated):
+def _centre_stddev(mixture, radius, centre, integrated):
     """Return the size of the weight under which a PSF is centred."""
     if centre == 'flux':
         return np.inf
     if integrated:
         mixture = mixture.convolve(stages.PIXEL_VARIANCE * np.eye(2))
-    return core_width(mixture)
+    width = core_width(mixture)
+    return max(width, min(_CENTRE_SIZE * width, _CENTRE_SHARE * radius))
 
 
 def _exposure_table(fit, n):

@@ -9,7 +9,7 @@ from astropy.table import QTable, Table
 from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss.field import stages
-from photutils_mgauss.field.choice import DEGREES
+from photutils_mgauss.field.choice import DEGREES, n_folds
 from photutils_mgauss.field.forms import FreeShapes
 from photutils_mgauss.field.normal import FieldProblem
 from photutils_mgauss.field.stamps import Stamps, cut_stamps, remove_star_noise
@@ -118,7 +118,7 @@ def read_sample(data, stars, error, mask, radius, gain):
         msg = (f'effective_gain must be None or a number greater than 0, got '
                f'{gain!r:.80}')
         raise ValueError(msg)
-    exposures = list(_exposures(data, stars, error, mask))
+    exposures = list(read_exposures(data, stars, error, mask))
     parts = [_read_one(pixels, table, radius, gain)
              for pixels, table in exposures]
     stamps = Stamps.joined([part[0] for part in parts])
@@ -194,7 +194,7 @@ def _check_light(stamps):
         raise ValueError(msg)
 
 
-def _exposures(data, stars, error, mask):
+def read_exposures(data, stars, error, mask):
     """Yield the pixels and the table of each exposure."""
     if isinstance(stars, Table) or not isinstance(stars, (list, tuple)):
         yield read_pixels(data, error, mask), stars
@@ -296,9 +296,9 @@ def _with_neighbours(sources, index, stamps):
 def possible_degree(degree, n_stars):
     """Return the highest degree to try; warn if a lower one must do."""
     if degree == 'auto':
-        # A third of the stars is left out while the degree is chosen.
-        return max(d for d in DEGREES
-                   if d == 0 or 2 * n_stars // 3 >= _stars_needed(d))
+        # Some of the stars are left out while the degree is chosen.
+        rest = n_stars - n_stars // n_folds(n_stars)
+        return max(d for d in DEGREES if d == 0 or rest >= _stars_needed(d))
     needed = _stars_needed(degree)
     if n_stars >= needed:
         return degree

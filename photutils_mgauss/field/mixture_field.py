@@ -12,7 +12,7 @@ Every parameter of each Gaussian is a polynomial of detector position,
 and all stars are fitted together, each with its own position and flux. No
 pixel is resampled on the way, and the variance is that of the model.
 """
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from astropy.table import QTable
@@ -28,6 +28,11 @@ from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 __all__ = ['MixtureField']
+
+
+# Of numerical derivatives.
+_STEP = 1e-4
+_WINGS = 'wing_share', 'wing_error', 'wing_stddev'
 
 
 @storable(detector={'ny': 'pix', 'nx': 'pix', 'radius': 'pix',
@@ -90,6 +95,11 @@ class MixtureField(Field):
     unmodelled : (6 K - 3,) `~numpy.ndarray`, optional
         The variances of the shapes about their polynomials, such as stars
         left out of the fit ask for; by default none.
+    wing_share, wing_error : float, optional
+        The share of the flux that one more Gaussian has, for the light beyond
+        the stamps, and its error; 0 unless that was measured.
+    wing_stddev : float, optional
+        The size of that Gaussian [pix].
 
     Examples
     --------
@@ -124,6 +134,9 @@ class MixtureField(Field):
     centre_stddev: float = np.inf
     pixel_integrated: bool = False
     unmodelled: np.ndarray = None
+    wing_share: float = 0.0
+    wing_error: float = 0.0
+    wing_stddev: float = 0.0
 
     def __repr__(self):
         return self._described(f'n_components={self.n_components}, ')
@@ -139,7 +152,9 @@ class MixtureField(Field):
                              'radius': [float(self.radius)],
                              'accuracy': [float(self.accuracy)],
                              'centre_stddev': [float(self.centre_stddev)],
-                             'pixel_integrated': [self.pixel_integrated]},
+                             'pixel_integrated': [self.pixel_integrated],
+                             **{name: [float(getattr(self, name))]
+                                for name in _WINGS}},
                 'terms': {'coefficient': self.coefficients},
                 'errors': {'covariance': self.covariance},
                 'stars': stars, 'dropped': table_columns(dropped)}
@@ -168,7 +183,9 @@ class MixtureField(Field):
                    QTable(stars), residual, float(detector['accuracy'][0]),
                    QTable(tables['dropped']), exposures=exposures,
                    centre_stddev=stddev, pixel_integrated=integrated,
-                   unmodelled=tables.get('unmodelled', {}).get('variance'))
+                   unmodelled=tables.get('unmodelled', {}).get('variance'),
+                   **{name: float(detector.get(name, [0.0])[0])
+                      for name in _WINGS})
 
     @property
     def n_components(self):
@@ -209,7 +226,57 @@ class MixtureField(Field):
             shapes.reshape(len(shapes), -1)[:, 3:] += change
         if exposure is not None:
             shapes = convolved(shapes, self._blur(exposure))
-        return mixture_arrays(shapes, self.centre_stddev)
+        mixtures = mixture_arrays(shapes, self.centre_stddev)
+        return self._with_wings(*mixtures) if self.wing_share else mixtures
+
+    def _with_wings(self, weights, means, covariances, shift):
+        """Add the Gaussian of the light beyond the stamps."""
+        n, share = len(weights), self.wing_share
+        wide = np.broadcast_to(self.wing_stddev**2 * np.eye(2), (n, 1, 2, 2))
+        return (np.hstack([(1 - share) * weights, np.full((n, 1), share)]),
+                np.concatenate([means, np.zeros((n, 1, 2))], axis=1),
+                np.concatenate([covariances, wide], axis=1), shift)
+
+    def aperture_correction_error(self, radius, x, y):
+        """
+        Return the standard deviation of `aperture_correction`.
+
+        It holds the noise of the fitted shapes and, if the light beyond the
+        stamps was measured, ``wing_error``.
+
+        Parameters
+        ----------
+        radius : float
+            The radius of the aperture [pix].
+        x, y : float
+            The position [pix].
+
+        Returns
+        -------
+        float
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the radius is not a positive number.
+        """
+        correction = self.aperture_correction(radius, x, y)
+        basis = stages.polynomials(*normalised([x], [y], self.shape),
+                                   self.degree)[0]
+        # All shapes are changed by their constant terms.
+        first = (np.arange(len(basis)) == 0)[:, None, None]
+        slopes = []
+        for shape in range(3, 6 * self.n_components):
+            change = np.zeros(6 * self.n_components)
+            change[shape] = _STEP
+            ends = [replace(self, coefficients=self.coefficients
+                            + sign * first * change.reshape(1, -1, 6)
+                            ).aperture_correction(radius, x, y)
+                    for sign in (1, -1)]
+            slopes.append((ends[0] - ends[1]) / (2 * _STEP))
+        slope = np.outer(slopes, basis).ravel()
+        shapes = slope @ self.covariance @ slope
+        return float(np.sqrt(shapes + (correction * self.wing_error) ** 2))
 
     def _basis(self, x, y):
         return stages.polynomials(*normalised(x, y, self.shape), self.degree)

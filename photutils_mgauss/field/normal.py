@@ -303,12 +303,13 @@ def to_coefficients(vector, like):
 
 
 def optimise(problem, coefficients, prior, workers, *, max_steps=30,
-             tolerance=1e-3):
+             tolerance=1e-3, damping=1e-3):
     """
     Minimise chi^2 plus prior by Levenberg-Marquardt steps.
 
-    Stops when a step gains less than ``tolerance`` times the number of stars.
-    The stamps' own numbers in ``problem`` are updated.
+    Stops when a step gains less than ``tolerance`` times the number of stars;
+    ``damping`` is that of the first step. The stamps' own numbers in
+    ``problem`` are updated.
 
     Returns
     -------
@@ -316,7 +317,7 @@ def optimise(problem, coefficients, prior, workers, *, max_steps=30,
     """
     present = equations(problem, coefficients, workers)
     cost = _cost(problem, present, prior, coefficients)
-    damping, growth = 1e-3, kernels.FIRST_GROWTH
+    growth = kernels.FIRST_GROWTH
     curvature = np.diag(to_vector(prior.precision))
     for _ in range(max_steps):
         problem.sources, problem.sky = present.sources, present.sky

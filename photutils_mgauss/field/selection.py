@@ -21,6 +21,13 @@ _NEIGHBOUR_SHARE = 0.01
 # many robust standard deviations and this share, are no single stars.
 _SHAPE_LIMIT = 5.0
 _SHAPE_SHARE = 0.15
+# Galaxies and blends have more light in this ring than stars [pix], by this
+# share of the light inside it.
+_RING = 3.0, 6.0
+_RING_SHARE = 0.02
+# A star of the catalogue is at most so far off [pix]. The catalogue is
+# believed if it leaves this many stars.
+_MATCH, _FEWEST_LISTED = 1.5, 8
 # Between two sources that are found [pix].
 _MIN_SEPARATION = 1.5
 
@@ -28,7 +35,7 @@ _MIN_SEPARATION = 1.5
 def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
                      threshold=None, radius=10, isolation=None,
                      saturation=None, min_snr=50, max_stars=None,
-                     finder=None):
+                     finder=None, catalogue=None):
     """
     Choose bright, isolated, unsaturated stars with whole stamps.
 
@@ -65,6 +72,10 @@ def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
     finder : callable, optional
         A photutils star finder, called as ``finder(data, mask=mask)``;
         by default a `~photutils.detection.DAOStarFinder`.
+    catalogue : `~astropy.table.Table`, optional
+        Stars that are known to be stars, as those of Gaia in the field, with
+        ``x`` and ``y`` [pix]. If at least 8 of them can be used, no others
+        are.
 
     Returns
     -------
@@ -72,8 +83,8 @@ def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
         All sources: ``id``, ``x``, ``y``, ``flux`` (within 3 pixels of the
         star), ``snr``, ``peak``, ``selected`` and, for those that are not,
         the ``reason``: 'outside', 'edge', 'masked', 'saturated', 'faint',
-        'neighbor', 'shape' or 'surplus'. `fit_mixture_field` takes it as it
-        is.
+        'neighbor', 'shape', 'unlisted' or 'surplus'. `fit_mixture_field`
+        takes it as it is.
 
     Raises
     ------
@@ -109,6 +120,8 @@ def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
     saturation = (np.inf if saturation is None else
                   read_level(saturation, 'saturation', pixels.unit))
     _judge(table, isolation, saturation, min_snr)
+    if catalogue is not None:
+        _prefer(table, read_sources(catalogue, 'catalogue'))
     if max_stars is not None:
         _thin_out(table, max_stars, pixels.shape)
     table['selected'] = np.asarray(table['reason']) == ''
@@ -156,13 +169,20 @@ def _measure(pixels, sources, radius):
     flux = light.sum(axis=(1, 2))
     noise = np.sqrt(np.where(inner, stamps.base, 0).sum(axis=(1, 2)))
     core = np.where(stamps.offsets() <= 1, light, 0).sum(axis=(1, 2))
+    distance = stamps.offsets()
+    ring = stamps.good & (distance > _RING[0]) & (
+        distance <= min(_RING[1], radius))
     n_circle = np.count_nonzero(stamps.offsets() <= radius + 0.5)
     table = QTable()
     table['id'] = np.arange(1, len(flux) + 1)
     table['x'], table['y'], table['flux'] = sources.x, sources.y, flux
     table['snr'] = flux / np.maximum(noise, 1e-300)
     table['peak'] = light.max(axis=(1, 2))
-    table['_core'] = core / np.where(flux > 0, flux, np.inf)
+    positive = np.where(flux > 0, flux, np.inf)
+    table['_core'] = core / positive
+    table['_ring'] = np.where(ring, stamps.data, 0).sum(axis=(1, 2)) / positive
+    table['_ring_noise'] = np.sqrt(np.where(ring, stamps.base, 0).sum(
+        axis=(1, 2))) / positive
     table['_good'] = stamps.good.sum(axis=(1, 2)) / n_circle
     half = stamps.radius
     ny, nx = pixels.shape
@@ -187,6 +207,7 @@ def _judge(table, isolation, saturation, min_snr):
     for name, applies in checks:
         reason[(reason == '') & np.asarray(applies)] = name
     reason[(reason == '') & _odd_shape(table['_core'], reason == '')] = 'shape'
+    reason[(reason == '') & _extended(table, reason == '')] = 'shape'
     table['reason'] = words_column(reason)
 
 
@@ -212,6 +233,33 @@ def _odd_shape(core, candidates):
     scatter = mad_std(core[candidates])
     limit = max(_SHAPE_LIMIT * scatter, _SHAPE_SHARE * middle)
     return np.abs(core - middle) > limit
+
+
+def _extended(table, candidates):
+    """Return which stars have more light around them than the others."""
+    # Of a star with another one in the ring it says nothing.
+    alone = candidates & ~_has_neighbour(table, _RING[1] + 2)
+    if alone.sum() < 5:
+        return np.zeros(alone.size, bool)
+    ring, noise = (np.asarray(table[name]) for name in ('_ring',
+                                                        '_ring_noise'))
+    middle = np.median(ring[alone])
+    scatter = mad_std(ring[alone])
+    limit = np.maximum(_SHAPE_LIMIT * np.hypot(scatter, noise), _RING_SHARE)
+    return alone & (ring - middle > limit)
+
+
+def _prefer(table, catalogue):
+    """Keep only stars of the catalogue if they are enough, in place."""
+    known = np.isfinite(catalogue.x) & np.isfinite(catalogue.y)
+    usable = np.flatnonzero(np.asarray(table['reason']) == '')
+    if not known.any() or not usable.size:
+        return
+    tree = KDTree(np.column_stack([catalogue.x, catalogue.y])[known])
+    listed = tree.query(np.column_stack(
+        [table['x'], table['y']])[usable])[0] <= _MATCH
+    if listed.sum() >= _FEWEST_LISTED:
+        table['reason'][usable[~listed]] = 'unlisted'
 
 
 def _thin_out(table, max_stars, shape):

@@ -25,6 +25,10 @@ _START_STARS = 40
 _STARS_PER_TERM = 40
 # A pixel is deviant beyond this many standard deviations.
 _PIXEL_LIMIT = 5.0
+# What a model that is not final may err by, in shares of the light, before it
+# calls bright pixels and stars deviant: those at the corners, which no others
+# support, would be lost first.
+_ALLOWANCE = 0.03
 # A star is deviant if its reduced chi^2 is beyond the median by this many
 # robust standard deviations and by this share of the median, or if it has
 # more than this share of deviant pixels.
@@ -255,7 +259,7 @@ def weigh(state, *, reject, share=1.0):
                                            problem)
     variance = variance + (state.accuracy * light) ** 2
     if reject and residual is not None:
-        _reject(state, residual, variance)
+        _reject(state, residual, variance + (_ALLOWANCE * light) ** 2)
     problem.weights = np.where(good & ~state.deviant_pixels, 1 / variance, 0)
 
 
@@ -333,12 +337,11 @@ def run(problem, n_components, degree, workers, *, strength=1.0, reject=True):
 
 
 def degrees(problem, n_components, top, strength, workers):
-    """Yield coefficients and blurs of each degree from 0 to the top one."""
+    """Yield a `FieldFit` of each degree from 0 to the top one."""
     state = _first_state(problem, n_components, top, strength, workers)
     for degree in range(top + 1):
-        _stage(state, np.arange(len(problem.basis)), degree, workers, True,
-               adapt=True)
-        yield state.coefficients, state.blurs
+        yield _stage(state, np.arange(len(problem.basis)), degree, workers,
+                     True, adapt=True)
 
 
 def _first_state(problem, n_components, degree, strength, workers):
@@ -350,7 +353,11 @@ def _first_state(problem, n_components, degree, strength, workers):
 
 
 def _stage(state, index, degree, workers, reject, *, adapt=False):
-    """Fit some of the stars at a low degree; only coefficients remain."""
+    """
+    Fit some of the stars at a low degree.
+
+    Only coefficients remain in ``state``; the fit itself is returned.
+    """
     terms = n_terms(degree)
     few = state.problem.subset(index)
     few.basis = np.ascontiguousarray(few.basis[:, :terms])
@@ -367,6 +374,7 @@ def _stage(state, index, degree, workers, reject, *, adapt=False):
         _adapt(part, workers, reject)
     state.coefficients, state.accuracy = part.coefficients, part.accuracy
     state.blurs = part.blurs
+    return part
 
 
 def _fit_blurs(state, workers):

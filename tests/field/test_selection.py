@@ -109,3 +109,44 @@ def test_selected_stars_have_no_reason_after_a_file_too(data, tmp_path):
     again = Table.read(tmp_path / 'stars.ecsv')
     assert list(again['reason']) == list(table['reason'])
     assert (again['reason'] == '').sum() == table['selected'].sum() > 0
+
+
+def small_galaxies(rng, n, shape):
+    """Return an image of stars and galaxies, and where both are."""
+    grid = np.mgrid[25:shape[1] - 20:32, 25:shape[0] - 20:32].reshape(2, -1).T
+    places = grid + rng.uniform(-3, 3, grid.shape)
+    data = rng.normal(0, 3, shape)
+    is_star = np.arange(len(places)) >= n
+    star = GaussianMixture([0.8, 0.2], np.zeros((2, 2)),
+                           [np.eye(2), 4 * np.eye(2)])
+    for place, single in zip(places, is_star, strict=True):
+        flux = 10 ** rng.uniform(4, 5)
+        size = rng.uniform(0.7, 2.5)
+        # An exponential disc, nearly, at some inclination.
+        disc = GaussianMixture(
+            [0.2, 0.4, 0.4], np.zeros((3, 2)),
+            [np.diag([1, rng.uniform(0.3, 1)]) * s * size**2
+             for s in (0.1, 0.8, 3)])
+        psf = star if single else GaussianMixture(
+            np.outer(star.weights, disc.weights).ravel(), np.zeros((6, 2)),
+            [a + b for a in star.covariances for b in disc.covariances])
+        data += psf.render(shape, *place, flux=flux)
+    return data, places, is_star
+
+
+def test_small_galaxies_stay_out(rng):
+    data, places, is_star = small_galaxies(rng, 50, (420, 420))
+    table = select_psf_stars(data, error=np.full(data.shape, 3.0))
+    reasons = np.array([reason_at(table, *place) for place in places])
+    assert np.sum(reasons[~is_star] == '') <= 1
+    assert np.mean(reasons[is_star] == '') > 0.95
+
+
+def test_stars_of_a_catalogue_are_preferred_if_they_are_enough(rng):
+    data, places, is_star = small_galaxies(rng, 50, (420, 420))
+    for n, reason in ((20, 'unlisted'), (5, '')):
+        x, y = places[is_star][:n].T
+        table = select_psf_stars(data, catalogue=Table({'x': x, 'y': y}))
+        other = places[is_star][25]
+        assert reason_at(table, *other) == reason
+        assert reason_at(table, x[0], y[0]) == ''

@@ -1,0 +1,194 @@
+r"""
+How far the light of stars reaches, beyond the pixels a field is fitted to.
+
+In rings about stars of flux F beyond the stamps' radius R the mean of the
+pixels is
+
+.. math::
+
+    \langle d \rangle_r = b + A F\, (r / R)^{-\gamma} ,
+
+the profile a power law, as diffraction and seeing make it, and b what does
+not depend on the star: an error of the background, and faint sources. The
+light beyond R is :math:`2 \pi A R^2 / (\gamma - 2)` of the flux.
+"""
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from astropy.stats import mad_std, sigma_clip
+from scipy.spatial import KDTree
+
+from photutils_mgauss.field.stamps import cut_stamps
+
+# The radius of the stamps if it is not given: so many full widths at half
+# maximum, but between these [pix].
+FIRST_RADIUS = 10
+_WIDTHS, _LARGEST = 4, 20
+# Rings from the radius of the stamps to so many times that.
+_N_RINGS, _REACH = 10, 3.0
+# The slopes of power laws that are looked for: a flatter one has no end.
+_FLATTEST, _STEEPEST = 2.5, 6.0
+# What is expected of them: diffraction's, unless the stars say otherwise.
+_USUAL_SLOPE, _SLOPE_STDDEV = 3.0, 0.25
+_CLIP = 4.0
+_FEWEST_STARS = 5
+# The size of the Gaussian that carries the light, in radii of the stamps: wide
+# enough to change nothing inside.
+_SIZE = 2.0
+
+
+@dataclass(frozen=True)
+class Wings:
+    """
+    The light beyond the stamps, as a wide Gaussian.
+
+    Attributes
+    ----------
+    share, error : float
+        Its share of the PSF's flux, and the error of that.
+    stddev : float
+        Its size [pix].
+    """
+
+    share: float
+    error: float
+    stddev: float
+
+
+def own_radius(stamps):
+    """Return the radius that fits the width of the stars [pix]."""
+    width = 2 * _half_radius(stamps)
+    return float(np.clip(np.ceil(_WIDTHS * width), FIRST_RADIUS, _LARGEST))
+
+
+def _half_radius(stamps):
+    """Return where the mean star falls to half of its peak [pix]."""
+    distance = stamps.offsets()
+    inner = distance <= 2.5
+    light = np.where(stamps.good, stamps.data, 0)[:, inner].sum(axis=1)
+    shares = np.where(stamps.good, stamps.data, np.nan)[light > 0]
+    shares = shares / light[light > 0, None, None]
+    steps = np.arange(0, stamps.radius)
+    rings = [shares[:, np.abs(distance - step) <= 0.5] for step in steps]
+    profile = np.array([np.nanmedian(ring) if np.isfinite(ring).any()
+                        else 0.0 for ring in rings])
+    below = np.flatnonzero(profile < profile[0] / 2)
+    if below.size == 0:
+        return float(stamps.radius)
+    last = below[0]
+    high, low = profile[last - 1:last + 1] / profile[0]
+    return last - 1 + (high - 0.5) / (high - low)
+
+
+def measure_wings(exposures, catalogues, stars, inside, radius):
+    """
+    Measure the light beyond the stamps of a field.
+
+    Parameters
+    ----------
+    exposures : list of PixelData
+    catalogues : list of Sources
+        All sources of each exposure; pixels near others are left out.
+    stars : list of (n, 3) `~numpy.ndarray`
+        x, y and flux of the stars of each exposure that are used.
+    inside : float
+        The light inside the stamps, in fluxes of the stars.
+    radius : float
+        Of the stamps [pix].
+
+    Returns
+    -------
+    Wings
+    """
+    edges = np.geomspace(radius + 0.5, _REACH * radius, _N_RINGS + 1)
+    parts = [_ring_means(*one, edges) for one in zip(
+        exposures, catalogues, stars, strict=True)]
+    flux = np.concatenate([np.asarray(one)[:, 2] for one in stars])
+    means, counts = (np.concatenate(one) for one in zip(*parts, strict=True))
+    enough = np.count_nonzero(counts.sum(axis=1))
+    if enough < _FEWEST_STARS:
+        msg = (f"normalise='curve-of-growth' needs at least {_FEWEST_STARS} "
+               f'stars with free pixels up to {_REACH:.0f} radii around, got '
+               f'{enough}')
+        raise ValueError(msg)
+    middle = np.sqrt(edges[1:] * edges[:-1]) / edges[0]
+    light, error = _light_beyond(flux, means, counts, middle)
+    light, error = light * edges[0] ** 2, error * edges[0] ** 2
+    total = inside + max(light, 0)
+    return Wings(max(1 - 1 / total, 0.0), error / total**2, _SIZE * radius)
+
+
+def _ring_means(pixels, catalogue, stars, edges):
+    """Return clipped means and numbers of pixels (n, rings)."""
+    reach = edges[-1]
+    stamps = cut_stamps(pixels, stars[:, 0], stars[:, 1], reach)
+    known = np.isfinite(catalogue.x) & np.isfinite(catalogue.y)
+    others = np.column_stack([catalogue.x, catalogue.y])[known]
+    tree = KDTree(others) if len(others) else None
+    steps = np.arange(stamps.data.shape[1])
+    means = np.zeros((len(stars), len(edges) - 1))
+    counts = np.zeros(means.shape)
+    for i, star in enumerate(stars):
+        x = stamps.corners[i, 0] + steps
+        y = (stamps.corners[i, 1] + steps)[:, None]
+        distance = np.hypot(x - star[0], y - star[1])
+        good = stamps.good[i].copy()
+        for near in tree.query_ball_point(star[:2], reach + edges[0]):
+            other = others[near]
+            if np.hypot(*(other - star[:2])) > 2:
+                good &= np.hypot(x - other[0], y - other[1]) > edges[0]
+        for ring in range(means.shape[1]):
+            inside = good & (distance > edges[ring])
+            inside &= distance <= edges[ring + 1]
+            counts[i, ring] = np.count_nonzero(inside)
+            if counts[i, ring]:
+                means[i, ring] = np.mean(sigma_clip(
+                    stamps.data[i][inside], _CLIP, maxiters=3,
+                    masked=False))
+    return means, counts
+
+
+def _light_beyond(flux, means, counts, middle):
+    """Return light beyond the first edge over its square, and the error."""
+    slopes = np.linspace(_FLATTEST, _STEEPEST, 36)
+    kept = counts > 0
+    for _ in range(4):
+        fits = [_height(flux[:, None] * middle**-slope, means, counts * kept)
+                for slope in slopes]
+        best = min(fits, key=lambda fit: fit.chi2)
+        pulls = best.residual * np.sqrt(counts)
+        scatter = max(mad_std(pulls[kept]), 1e-300)
+        kept = (counts > 0) & (np.abs(pulls) < _CLIP * scatter)
+    heights, errors, chi2 = (np.array([getattr(fit, name) for fit in fits])
+                             for name in ('height', 'error', 'chi2'))
+    # What is beside a star spoils several of its rings: they count as one.
+    scatter *= np.sqrt(len(middle))
+    cost = (chi2 / scatter**2
+            + ((slopes - _USUAL_SLOPE) / _SLOPE_STDDEV) ** 2)
+    likely = np.exp(-0.5 * (cost - cost.min()))
+    likely /= likely.sum()
+    factor = 2 * np.pi / (slopes - 2)
+    mean = likely @ (heights * factor)
+    variance = likely @ ((heights * factor - mean) ** 2
+                         + (errors * scatter * factor) ** 2)
+    return mean, np.sqrt(variance)
+
+
+class _Fit(NamedTuple):
+    height: float
+    error: float
+    chi2: float
+    residual: np.ndarray
+
+
+def _height(shape, means, counts):
+    """Fit means (n, rings) by a height times a shape, and a constant."""
+    total = counts.sum()
+    about = shape - (counts * shape).sum() / total
+    middle = (counts * means).sum() / total
+    precision = (counts * about**2).sum()
+    height = (counts * about * means).sum() / precision
+    residual = means - middle - height * about
+    return _Fit(height, precision**-0.5, (counts * residual**2).sum(),
+                residual)
