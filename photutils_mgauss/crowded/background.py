@@ -120,6 +120,11 @@ class Mesh:
         return (np.where(np.isfinite(low), low, -np.inf),
                 np.where(np.isfinite(high), high, np.inf))
 
+    def medians(self, data, good):
+        """Return the medians (n,) of nodes' good pixels, infinite if none."""
+        middle, = self._percentiles(data, good, [50])
+        return np.where(np.isfinite(middle), middle, np.inf)
+
     def _percentiles(self, data, good, which):
         """Return percentiles (..., n) of each node's good pixels, or NaN."""
         out = np.full((*self.shape, *np.shape(which)), np.nan)

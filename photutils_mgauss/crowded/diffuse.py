@@ -6,7 +6,7 @@ on as small a scale as it can be told from noise and from stars not found:
 on an even sky there is none.
 """
 import numpy as np
-from scipy.ndimage import convolve, gaussian_filter
+from scipy.ndimage import convolve, gaussian_filter, median_filter
 
 from photutils_mgauss.crowded.background import Mesh
 
@@ -54,6 +54,27 @@ class Diffuse:
         self.level = _beyond(self.level, noise)
         return wide
 
+    def bound(self, data, good, noise, mesh, lowest):
+        """
+        Note between what levels light and sky together have to be.
+
+        Stars only add light: there is no more of all else than in the median
+        pixel of most blocks around, and no less than the lowest levels of the
+        mesh.
+        """
+        self._low = mesh.at(*self._places(), lowest)
+        middle = self.mesh.medians(data, good).reshape(self.mesh.shape)
+        self._high = median_filter(middle, 3).ravel() + 3 * noise
+
+    def keep_bounds(self, mesh, level):
+        """Make the light keep its bounds above levels of the mesh."""
+        sky = mesh.at(*self._places(), level)
+        self.level = np.clip(self.level, self._low - sky, self._high - sky)
+
+    def _places(self):
+        """Return x and y of the blocks (n,)."""
+        return (v.ravel() for v in np.meshgrid(self.mesh.x, self.mesh.y))
+
     def update(self, residual, weight, mesh, noise):
         """Find the light in what stars and sky have left over; see `begin`."""
         excess = residual + self.image()
@@ -67,8 +88,7 @@ class Diffuse:
 
     def _take(self, level, information, mesh, noise):
         """Divide blocks' levels between a mesh of wider nodes and the rest."""
-        y, x = (v.ravel() for v in np.meshgrid(self.mesh.y, self.mesh.x,
-                                               indexing='ij'))
+        x, y = self._places()
         wide = _node_means(mesh, x, y, level, information)
         self.level = self._smooth(level - mesh.at(x, y, wide), information)
         # The joint fit finds levels better, but not from far away.

@@ -20,8 +20,10 @@ _LEAST_CHANGE, _MOST_CHANGE = 0.2, 2.5
 _TOLERANCE = 1e-6
 _CG_STEPS = 400
 # Where stars are so many that together they can be a background, its steps
-# are to be small: this is added to the information of nodes, as a fraction.
-_LEVEL_DAMPING = 0.1
+# are to be small: this is added to the information of nodes, as a fraction,
+# times the mean square of the pixels' residuals, in standard errors and at
+# most so large. Where the stars are not yet the right ones the sky is stiff.
+_LEVEL_DAMPING, _LARGEST_SQUARE = 0.1, 100.0
 # What is known beforehand moves no flux by more standard errors than this.
 _STRONGEST_PULL = 0.5
 # Pixels further than this from the model take no part in the background.
@@ -39,6 +41,7 @@ class Equations:
     stars: kernels.StarEquations
     mesh: kernels.MeshEquations
     neighbours: Neighbours
+    level_damping: np.ndarray
 
     @classmethod
     def of(cls, model):
@@ -46,14 +49,15 @@ class Equations:
         stars = _star_equations(model)
         _hold(stars, model.stars)
         _expect(stars, model.stars, model.options.count_slope)
-        return cls(stars, _mesh_equations(model, stars), model.neighbours)
+        return cls(stars, _mesh_equations(model, stars), model.neighbours,
+                   _level_damping(model))
 
     def solve(self, damping):
         """Return the Gauss-Newton steps of the stars (n, 3) and the level."""
         stars = self.stars._replace(
             matrix=self.stars.matrix * (1 + damping * np.eye(3)))
         mesh = self.mesh._replace(
-            diagonal=self.mesh.diagonal * (1 + _LEVEL_DAMPING))
+            diagonal=self.mesh.diagonal * (1 + self.level_damping))
         n = len(stars.matrix)
         step = np.zeros(3 * n + self.mesh.gradient.size)
         kernels.solve_joint(
@@ -69,6 +73,13 @@ class Equations:
                                   self.neighbours.nearest, covariance,
                                   correlation)
         return covariance, correlation
+
+
+def _level_damping(model):
+    """Return the damping of the nodes (m,), as a fraction."""
+    square = np.minimum(model.weight * model.residual**2, _LARGEST_SQUARE)
+    mean, _ = model.mesh.means((model.weight > 0).astype(float), square)
+    return _LEVEL_DAMPING * np.maximum(mean, 1)
 
 
 def limited(step, stars):

@@ -84,6 +84,8 @@ class Model:
         self.level += self.diffuse.begin(
             self.data - self.mesh.image(self.level), self.good, self.noise,
             self.mesh)
+        self.diffuse.bound(self.data, self.good, self.noise, self.mesh,
+                           self.limits[0])
 
     def _put(self, stars):
         self.stars = stars
@@ -196,6 +198,7 @@ class Model:
             self.level = np.clip(self.level + self.diffuse.update(
                 self.residual, self.weight, self.mesh, self.noise),
                 *self.limits)
+            self.diffuse.keep_bounds(self.mesh, self.level)
             self.residual += before - self.background()
 
     def star_light(self):
