@@ -62,7 +62,7 @@ class Diffuse:
         pixel of most blocks around, and no less than the lowest levels of the
         mesh.
         """
-        self._low = mesh.at(*self._places(), lowest)
+        self._low = lowest[mesh.owners(*self._places())]
         middle = self.mesh.medians(data, good).reshape(self.mesh.shape)
         self._high = median_filter(middle, 3).ravel() + 3 * noise
 

@@ -142,9 +142,10 @@ def _in_squares(image, stars, number, side):
     matrix[_REACH, _REACH] = 1
     # Pairs are correlated with each other, if pixels are.
     deviation = np.sqrt((matrix**2).sum() / pairs)
-    near = [matrix[_REACH, _REACH + 1], matrix[_REACH + 1, _REACH]]
-    if not (np.mean(near) > _LEAST
-            and np.mean(near) > _SIGNIFICANT * deviation[_REACH, _REACH]):
+    # What scatters more than the errors say may be light that is not listed.
+    near = np.mean([matrix[_REACH, _REACH + 1], matrix[_REACH + 1, _REACH]])
+    near -= max(1 - 1 / variance, 0)
+    if near < max(_LEAST, _SIGNIFICANT * deviation[_REACH, _REACH]):
         return None
     matrix[np.abs(matrix) < _SIGNIFICANT * deviation] = 0
     return NoiseCorrelation(matrix, float(np.sqrt(variance)))

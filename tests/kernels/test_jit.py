@@ -154,7 +154,10 @@ def test_no_module_outside_the_room_names_numba():
 def test_what_is_compiled_for_python_is_handed_on():
     for name in set(kernels.__all__):
         getattr(kernels, name)
-    assert set(jit.KERNELS) <= set(kernels.__all__)
+    own = {name for name, function in jit.KERNELS.items()
+           if function.py_func.__module__.startswith('photutils_mgauss')}
+    assert own
+    assert own <= set(kernels.__all__)
 
 
 def test_the_command_compiles_every_kernel():
