@@ -23,6 +23,8 @@ from photutils_mgauss import kernels
 from photutils_mgauss.psf.rows import kernel_rows_of_logs
 from photutils_mgauss.utils.parallel import Threads
 
+# The chi^2 of a size beyond the widest, its logarithm by one.
+_WALL = 1e4
 # Standard deviations of the prior on log weight, x, y (of the PSF's width),
 # log_p, s, log_q: of a polynomial's constant, and of its other terms. A good
 # star overrules them by far; they decide what the stars say nothing about,
@@ -216,22 +218,24 @@ class Prior:
 
     Both have the shape of the coefficients, (T, K, 6) or (T, N).
 
-    The terms a lower degree does not have are the last ones.
+    The terms a lower degree does not have are the last ones. Mixtures' mean
+    sizes meet a wall at ``widest`` [pix].
     """
 
     mean: np.ndarray
     precision: np.ndarray
     strength: float = 1.0
+    widest: float = np.inf
 
     @classmethod
-    def about(cls, shapes, n_terms, width, strength=1.0):
+    def about(cls, shapes, n_terms, width, strength=1.0, widest=np.inf):
         """Return the prior about the constant shapes (K, 6)."""
         mean = np.zeros((n_terms, *shapes.shape))
         mean[0] = shapes
         scale = np.array([1, width, width, 1, 1, 1])
         stddev = np.tile(_PRIOR_VARIATION * scale, (n_terms, len(shapes), 1))
         stddev[0] = _PRIOR_CONSTANT * scale
-        return cls(mean, strength / stddev**2, strength)
+        return cls(mean, strength / stddev**2, strength, widest)
 
     @classmethod
     def of_changes(cls, n_terms, width, strength=1.0):
@@ -277,11 +281,27 @@ class Prior:
 
     def cost(self, coefficients):
         """Return the chi^2 of coefficients."""
-        return np.sum(self.precision * (coefficients - self.mean) ** 2)
+        return (np.sum(self.precision * (coefficients - self.mean) ** 2)
+                + _WALL * np.sum(self._beyond(coefficients) ** 2))
 
     def right(self, coefficients):
         """Return the pull towards the mean, in the order of unknowns."""
-        return to_vector(self.precision * (self.mean - coefficients))
+        return to_vector(self.precision * (self.mean - coefficients)
+                         + _WALL * self._beyond(coefficients))
+
+    def curvature(self, coefficients):
+        """Return the diagonal that belongs to it."""
+        return to_vector(self.precision
+                         + _WALL * (self._beyond(coefficients) > 0))
+
+    def _beyond(self, coefficients):
+        """Return by how much log sizes are beyond the wall, 0 elsewhere."""
+        out = np.zeros(coefficients.shape)
+        if np.isfinite(self.widest):
+            sizes = [3, 5]
+            out[0, :, sizes] = np.maximum(
+                -np.log(self.widest) - coefficients[0, :, sizes], 0)
+        return out
 
 
 def to_vector(coefficients):
@@ -318,10 +338,9 @@ def optimise(problem, coefficients, prior, workers, *, max_steps=30,
     present = equations(problem, coefficients, workers)
     cost = _cost(problem, present, prior, coefficients)
     growth = kernels.FIRST_GROWTH
-    curvature = np.diag(to_vector(prior.precision))
     for _ in range(max_steps):
         problem.sources, problem.sky = present.sources, present.sky
-        matrix = present.matrix + curvature
+        matrix = present.matrix + np.diag(prior.curvature(coefficients))
         right = present.right + prior.right(coefficients)
         step = _damped_step(matrix, right, damping)
         expected = step @ (2 * right - matrix @ step)

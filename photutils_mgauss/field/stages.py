@@ -224,9 +224,18 @@ def _new_state(problem, shapes, width, strength):
     terms = problem.basis.shape[1]
     coefficients = np.zeros((terms, *shapes.shape))
     coefficients[0] = shapes
-    prior = Prior.about(shapes, terms, width, strength)
+    prior = Prior.about(shapes, terms, width, strength, _widest(problem))
     return FieldFit(problem, coefficients, prior, None, _FIRST_ACCURACY,
                     np.zeros(problem.stamps.good.shape, bool))
+
+
+def _widest(problem):
+    """
+    Return the largest standard deviation of a Gaussian [pix].
+
+    What falls by less than a factor e to the edge of a stamp is its sky.
+    """
+    return problem.stamps.radius / np.sqrt(2)
 
 
 def advance(state, workers, **options):
@@ -346,7 +355,8 @@ def degrees(problem, n_components, top, strength, workers):
 
 def _first_state(problem, n_components, degree, strength, workers):
     start, shapes, width = begin(problem, n_components, strength, workers)
-    prior = Prior.about(shapes, n_terms(degree), width, strength)
+    prior = Prior.about(shapes, n_terms(degree), width, strength,
+                        _widest(problem))
     return FieldFit(problem, start, prior, None, _FIRST_ACCURACY,
                     np.zeros(problem.stamps.good.shape, bool),
                     np.zeros((problem.exposure.max() + 1, 3)))

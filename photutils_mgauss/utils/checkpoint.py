@@ -79,6 +79,9 @@ class Checkpoint:
         if folder is not None and not isinstance(folder, (str, os.PathLike)):
             msg = f'checkpoint must be the name of a folder, got {folder!r}'
             raise TypeError(msg)
+        if folder is not None and not os.fspath(folder).strip():
+            msg = 'checkpoint must be the name of a folder, got none'
+            raise ValueError(msg)
         self.folder = None if folder is None else Path(folder)
         if self.folder and self.folder.exists() and not self.folder.is_dir():
             msg = f'checkpoint must be a folder, but {folder} is a file'

@@ -1,5 +1,6 @@
 """Laws of fields fitted to star pixels, and comparisons with the truth."""
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from photutils_mgauss import (
     GriddedMixturePSF,
     fit_mixture_field,
 )
+from photutils_mgauss.field import normal
 from photutils_mgauss.field.forms import FreeShapes
 from photutils_mgauss.field.normal import (
     FieldProblem,
@@ -330,3 +332,20 @@ def test_left_out_stars_choose_degree_and_number_of_gaussians(stars, clean):
     assert field.degree in (1, 2)
     scores = field.choice['reduced_chi2']
     assert scores[field.choice['degree'] == 0].min() > scores.min()
+
+
+def test_no_gaussian_is_as_flat_as_the_sky(stars, clean, monkeypatch):
+    data, _, error = noisy(clean, np.random.default_rng(6))
+    # The sky was taken too low.
+    fit = partial(fit_mixture_field, data + 12, stars, error=error,
+                  n_components=3, degree=1, radius=8)
+    widest = 8 / np.sqrt(2)
+    assert sizes(fit()).max() < 1.15 * widest
+    monkeypatch.setattr(normal, '_WALL', 0.0)
+    assert sizes(fit()).max() > 1.5 * widest
+
+
+def sizes(field):
+    """Return the standard deviations along the axes (K, 2) of Gaussians."""
+    values = np.linalg.eigvalsh(field.mixture_at(120, 100).covariances)
+    return np.sqrt(values)

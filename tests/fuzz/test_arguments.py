@@ -1,4 +1,5 @@
 """Odd arguments of every public function; see `arguments`."""
+import contextlib
 import sys
 
 import numpy as np
@@ -21,6 +22,13 @@ NOT_CALLED = {
     'PixelPhaseError', 'Scene', 'ShapeStatus', 'Shapes', 'SimulatedCatalogue',
     'TunedMixtureField', 'UnfinishedTilesError', 'read_psfex',
     'sample_mixture'}
+
+
+@pytest.fixture(scope='module', autouse=True)
+def _elsewhere(tmp_path_factory):
+    """Work in a folder of its own: odd texts may be names of folders."""
+    with contextlib.chdir(tmp_path_factory.mktemp('odd')):
+        yield
 
 
 @pytest.fixture(scope='module')
