@@ -64,9 +64,9 @@ def run(options):
     """Measure the images."""
     paths = options.inputs
     if not options.psf and not options.crowded:
-        msg = ('--psf must be given, got none; without it, mgauss psf makes '
-               'one of an image, and --crowded one of the stars of each image')
-        raise ValueError(msg)
+        options.parser.error(
+            '--psf must be given, got none; without it, mgauss psf makes '
+            'one of an image, and --crowded one of the stars of each image')
     tools.check_inputs([*paths, *options.psf])
     tools.check_different(paths)
     names = tools.output_names(paths, options.output, '_cat', _SUFFIXES,
@@ -135,7 +135,7 @@ def _check_fits(image, table):
         warnings.warn(
             f'{image.path}: the PSF does not describe the {chi2.size} '
             f'brightest stars (median reduced chi2 {np.median(chi2):.3g}); '
-            'their errors do not contain that of the PSF', UserWarning,
+            'their errors are too small', UserWarning,
             stacklevel=2)
 
 

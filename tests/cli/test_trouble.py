@@ -200,7 +200,6 @@ def no_work(monkeypatch):
     ('motions 1.fits 2.fits --output 1.fits', 'must be a folder'),
     ('motions 1.fits 2.fits --output 1.fits/a', '1.fits is a file'),
     ('photometry 1.fits ./1.fits --psf psf.fits', 'given only once'),
-    ('photometry 1.fits --output new/', '--psf must be given, got none'),
     ('photometry 1.fits --psf 1.fits --output new/', '1.fits: must hold a'),
     ('photometry 1.fits --psf psf.fits --error no.fits', 'no.fits: must be'),
     ('photometry 1.fits --psf psf.fits --output 1.fits --overwrite',

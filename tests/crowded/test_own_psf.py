@@ -22,7 +22,7 @@ from photutils_mgauss import (
 from photutils_mgauss.crowded import psf_loop
 
 SHAPE = (160, 160)
-QUICK = {'n_components': 4, 'degree': 1, 'radius': 10, 'max_stars': 60}
+QUICK = {'n_components': 3, 'degree': 1, 'radius': 10, 'max_stars': 100}
 
 
 @cache
@@ -65,7 +65,7 @@ def beside_truth(table, low, high):
 @pytest.mark.parametrize(('low', 'high', 'ratio'), [
     (17, 20, 1.6), (20, 22, 1.1)])
 def test_stars_are_measured_almost_as_with_the_true_psf(low, high, ratio):
-    # Four Gaussians and sixty stars: the brightest ask for more.
+    # Three Gaussians: the brightest stars ask for more.
     true, own = (beside_truth(measured(psf), low, high)
                  for psf in (scene()[0], psf_loop.grid_of(field())))
     assert len(own[0]) >= 0.98 * len(true[0])
@@ -81,7 +81,7 @@ def test_each_bright_star_is_used_or_has_a_reason_why_not():
         'edge', 'masked', 'faint', 'extended', 'blended', 'surplus',
         'deviant'}
     assert (dropped['reason'] == 'edge').sum() > 3
-    assert len(used) == QUICK['max_stars']
+    assert QUICK['max_stars'] / 2 < len(used) <= QUICK['max_stars']
     margin = np.min([used['x'], used['y'], 159 - used['x'],
                      159 - used['y']], axis=0)
     assert margin.min() > QUICK['radius']
