@@ -196,5 +196,5 @@ def shift_notes(table):
     return tuple(
         f'Image {k} lies {away[k]:.2f} pixels ({shift[k, 0]:+.2f}, '
         f'{shift[k, 1]:+.2f}) beside the place that its WCS and the other '
-        'images give: correct the WCS with ProperMotionFitter, or let '
-        'refine_frames do it.' for k in np.flatnonzero(wrong))
+        'images give: correct the WCS with ProperMotionFitter.'
+        for k in np.flatnonzero(wrong))
