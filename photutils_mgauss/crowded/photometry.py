@@ -319,7 +319,13 @@ class CrowdedMixturePhotometry:
 
     def fit_field(self, image, options):
         """
-        Fit the PSF of an image, PixelData with errors, to its stars.
+        Fit the PSF of an image to its stars.
+
+        Parameters
+        ----------
+        image : `~photutils_mgauss.utils.image.PixelData`
+            With errors.
+        options : `~photutils_mgauss.crowded.psf_loop.LoopOptions`
 
         Returns
         -------

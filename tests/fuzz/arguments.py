@@ -21,7 +21,7 @@ import numpy as np
 from astropy.table import Table
 from astropy.time import Time
 
-LONGEST = 20  # seconds
+LONGEST = 60  # seconds
 SPEAKING = ('photutils_mgauss', 'photutils', 'astropy')
 CLEAN = (TypeError, ValueError, OSError, u.UnitsError)
 
