@@ -91,8 +91,10 @@ class Grid:
 
     def neighbours(self, x, y):
         """Return the indices and bilinear weights (4,) at a position."""
-        i, fx = cells(np.atleast_1d(x), self.x_grid)
-        j, fy = cells(np.atleast_1d(y), self.y_grid)
+        x, y = (as_floats(value, name, shape=(), finite=False).reshape(1)
+                for value, name in ((x, 'x'), (y, 'y')))
+        i, fx = cells(x, self.x_grid)
+        j, fy = cells(y, self.y_grid)
         columns = np.append(i, np.minimum(i + 1, self.x_grid.size - 1))
         rows = np.append(j, np.minimum(j + 1, self.y_grid.size - 1))
         index = (rows[:, None] * self.x_grid.size + columns).ravel()
