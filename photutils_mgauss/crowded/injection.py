@@ -21,6 +21,8 @@ from photutils_mgauss.utils.validation import (
 # Artificial stars are drawn out to where this fraction of the smallest noise
 # is left of them.
 _FAINTEST = 1e-3
+# No generator of Poisson numbers goes beyond.
+_MOST_PHOTONS = 1e15
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,8 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     image, variance = pixels.part()
     flux = _true_fluxes(flux, pixels.unit)
     gain = as_real(effective_gain, 'effective_gain', above=0)
+    as_real(gain * max(flux), 'effective_gain times flux',
+            maximum=_MOST_PHOTONS)
     repeats = as_integer(repeats, 'repeats', minimum=1)
     separation = as_real(separation, 'separation', minimum=5)
     radius = as_real(radius, 'radius', above=0)

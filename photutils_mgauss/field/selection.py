@@ -139,7 +139,8 @@ def _detect(pixels, fwhm, threshold, finder):
     if finder is not None:
         data = with_unit(data, pixels.unit)
     else:
-        fwhm = 3.0 if fwhm is None else as_real(fwhm, 'fwhm', above=0)
+        fwhm = 3.0 if fwhm is None else as_real(
+            fwhm, 'fwhm', above=0, maximum=max(pixels.shape))
         if threshold is None:
             threshold = 5 * mad_std(data[~mask])
         threshold = read_level(threshold, 'threshold', pixels.unit)
