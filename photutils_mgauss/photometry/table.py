@@ -191,8 +191,11 @@ def fit_quality(result, n_free, has_error):
     chi2 = np.full(flux.size, np.nan)
     if has_error:
         np.divide(squares, dof, out=chi2, where=dof > 0)
-    # Adding zero makes a negative zero positive.
-    return absolute / flux + 0.0, centre / flux + 0.0, chi2
+    # What rounding leaves of a pixel is nothing, and zero is positive.
+    least = np.finfo(float).eps * result.n_pixels
+    ratios = [np.where(np.abs(ratio) <= least, 0.0, ratio)
+              for ratio in (absolute / flux, centre / flux)]
+    return *ratios, chi2
 
 
 def make_columns(result, quality, flags, unit):
