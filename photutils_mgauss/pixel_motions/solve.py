@@ -181,18 +181,18 @@ def _fit_all(campaign, values, *, groups, fit_shape, forced, own, spread_over,
     parts = []
     for group in groups:
         views = campaign.views(values[group])
-        todo = np.arange(len(group))
+        moving = np.arange(len(group))
         done = None
         for _ in range(3):
             fit = _fit_of(campaign, views, fit_shape, forced,
                           None if own is None else
-                          own[group[todo]].transpose(0, 2, 1, 3))
+                          own[group[moving]].transpose(0, 2, 1, 3))
             got = _minimize(fit, spread_over, sample and not forced)
-            done = got if done is None else _replaced(done, todo, got)
+            done = got if done is None else _replaced(done, moving, got)
             at = np.flatnonzero(_shift(got) > _LINEAR)
             if forced or not at.size:
                 break
-            todo = todo[at]
+            moving = moving[at]
             views = campaign.views(got.state.values[at])
         parts.append((group, done))
     return _collect(campaign, values, parts)
