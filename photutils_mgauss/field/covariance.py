@@ -202,7 +202,8 @@ def shape_covariance(covariance, unmodelled, basis):
     return np.einsum('nptq,nt->npq', half, basis) + np.diag(unmodelled)
 
 
-def psf_errors(at, covariance, unmodelled, degree, shape, integrated):
+def psf_errors(at, covariance, unmodelled, degree, shape, integrated,
+               more=()):
     """
     Return the errors of a field's PSF.
 
@@ -210,13 +211,16 @@ def psf_errors(at, covariance, unmodelled, degree, shape, integrated):
     ----------
     at : callable
         ``at(x, y, change)`` returns the polynomials (n, T), weights, means
-        and covariances at places (n,), with P numbers added to the shapes.
+        and covariances at places (n,), with P numbers added to the shapes
+        and Q to others.
     covariance, unmodelled : (N, N), (P,) `~numpy.ndarray`
     degree : int
     shape : (int, int)
         Of the detector.
     integrated : bool
         Whether the mixtures are to be integrated over pixels.
+    more : (Q,) sequence of float, optional
+        The variances of the other numbers, the same everywhere.
 
     Returns
     -------
@@ -227,11 +231,15 @@ def psf_errors(at, covariance, unmodelled, degree, shape, integrated):
     n = max(2 * degree + 1, 7) if degree else 1
     axes = [(np.arange(n) + 0.5) * size / n - 0.5 for size in shape[::-1]]
     x, y = (axis.ravel() for axis in np.meshgrid(*axes))
-    basis, *mixtures = at(x, y, np.zeros(unmodelled.size))
+    n_shapes = unmodelled.size
+    size = n_shapes + len(more)
+    basis, *mixtures = at(x, y, np.zeros(size))
     every = np.moveaxis(slopes(lambda change: _numbers(at(x, y, change)),
-                               unmodelled.size), 0, 1)
+                               size), 0, 1)
     grid = Grid(*axes, *mixtures, np.ones(x.size))
-    found = shape_covariance(covariance, unmodelled, basis)
+    found = np.tile(np.diag([0.0] * n_shapes + list(more)), (x.size, 1, 1))
+    found[:, :n_shapes, :n_shapes] = shape_covariance(covariance, unmodelled,
+                                                      basis)
     return PSFErrors(grid, _directions(PSFErrors(grid, every), found,
                                        integrated))
 

@@ -345,10 +345,14 @@ class MixtureField(Field):
         """Return stacked weights, means, covariances and shifts."""
         shapes = np.einsum('nt,tki->nki', self._basis(x, y, kind),
                            self._all_coefficients())
+        blur = kind.blur
         if change is not None:
-            shapes.reshape(len(shapes), -1)[:, 3:] += change
-        if kind.blur is not None:
-            shapes = convolved(shapes, kind.blur)
+            flat = shapes.reshape(len(shapes), -1)[:, 3:]
+            flat += change[:flat.shape[1]]
+            more = change[flat.shape[1]:]
+            blur = blur + more if more.size else blur
+        if blur is not None:
+            shapes = convolved(shapes, blur)
         weights, means, covariances, shift = mixture_arrays(
             shapes, self.centre_stddev)
         if kind.contexts.any():
@@ -451,7 +455,16 @@ class MixtureField(Field):
             lambda x, y, change: (self._basis(x, y, kind), *self._mixtures(
                 x, y, kind, change)[:3]),
             self.covariance, self._unmodelled(), self.degree, self.shape,
-            self.pixel_integrated)
+            self.pixel_integrated, self._blur_variance(exposure))
+
+    def _blur_variance(self, exposure):
+        """Return the variances (3,) of what an exposure adds, if any."""
+        if self.exposures is None or (exposure is None
+                                      and len(self.exposures) > 1):
+            return []
+        row = self.exposures[exposure or 0]
+        return np.nan_to_num([row[f'{name}_err']**2
+                              for name in ('xx', 'xy', 'yy')])
 
     def _blur(self, exposure):
         n = 1 if self.exposures is None else len(self.exposures)
