@@ -184,8 +184,7 @@ def _fwhm(psf, shape):
     """Return the width of the PSF in the middle of the image [pix]."""
     from photutils_mgauss.psf.shapes import adaptive_moments
     ny, nx = shape
-    r2 = float(adaptive_moments(psf.mixture_at(nx / 2, ny / 2)).r2)
-    return 2.3548 * (r2 / 2) ** 0.5
+    return float(adaptive_moments(psf.mixture_at(nx / 2, ny / 2)).fwhm)
 
 
 def _with_unit(table, unit):

@@ -134,7 +134,7 @@ def test_images_become_psfs_of_their_own_stars(chain):
 
 def test_catalogues_have_places_on_the_sky_that_are_true(chain):
     table = QTable.read(chain / 'night1_cat.ecsv')
-    assert {'x_fit', 'xy_cov', 'ra_err', 'radec_cov'} <= set(table.colnames)
+    assert {'x_fit', 'xy_cov', 'ra_error', 'radec_cov'} <= set(table.colnames)
     assert str(table['flux_fit'].unit) == 'electron'
     record = table.meta['mgauss']
     assert record['options']['fit_shape'] == 11
