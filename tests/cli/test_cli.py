@@ -461,7 +461,7 @@ def test_the_version_is_told(capsys):
 
 def test_help_comes_without_loading_what_computes():
     code = ('import sys, photutils_mgauss.cli.command as cli\n'
-            'cli._parser().format_help()\n'
+            'cli.make_parser().format_help()\n'
             'print(*sys.modules)')
     loaded = subprocess.run([sys.executable, '-c', code], check=True,
                             capture_output=True, text=True).stdout.split()
