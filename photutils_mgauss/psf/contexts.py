@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photutils_mgauss.psf.mixture import blend
+from photutils_mgauss.psf.blending import blend
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.utils.validation import as_real
 

@@ -132,3 +132,55 @@ def test_exposures_share_it():
         field = fit([list(one) for one in zip(*given, strict=True)])
     assert abs(field.brighter_fatter['xx'][0] * LARGEST - 0.05) < 0.005
     assert np.abs(field.exposures['xx']).max() < 0.01
+
+
+def repelled(x, y, flux):
+    """Return a scene of stars whose charge repels, in silicon."""
+    from photutils_mgauss.simulation import (
+        DetectorEffects,
+        Instrument,
+        csst_psf,
+        simulate,
+    )
+    camera = Instrument(shape=(320, 320), read_noise=3.0, dark=0.0,
+                        full_well=1e7, exposure_time=1.0)
+    return simulate(QTable({'x': x, 'y': y, 'flux': flux}), instrument=camera,
+                    psf=csst_psf((320, 320), variation=0), rng=3,
+                    effects=DetectorEffects(brighter_fatter=1.0))
+
+
+def weighted_size(stamp):
+    """Return the second moment of a star in the middle, under a Gaussian."""
+    half = len(stamp) // 2
+    y, x = np.mgrid[-half:half + 1, -half:half + 1]
+    weight = stamp * np.exp(-(x**2 + y**2) / 8)
+    return (weight * (x**2 + y**2)).sum() / weight.sum()
+
+
+def test_repulsion_in_silicon_is_found():
+    pytest.importorskip('galsim')
+    rng = np.random.default_rng(4)
+    y, x = np.mgrid[22:310:34, 22:310:34].reshape(2, -1).astype(float)
+    flux = 10 ** rng.uniform(4.5, 5.9, x.size)
+    scene = repelled(x + rng.uniform(-0.5, 0.5, x.size),
+                     y + rng.uniform(-0.5, 0.5, x.size), flux)
+    with pytest.warns(AstropyUserWarning, match='bright stars are wider'):
+        field = fit_mixture_field(
+            scene.image - scene.background,
+            QTable({'x': x, 'y': y, 'flux': flux}), error=scene.error,
+            n_components=3, degree=0)
+    # What silicon does to stars in the middle of pixels, on other images.
+    sizes = {}
+    for level in (4e4, 7e5):
+        again = repelled(x, y, np.full(x.size, level))
+        light = again.image - again.background
+        sizes[level] = np.mean([weighted_size(
+            light[int(b) - 8:int(b) + 9, int(a) - 8:int(a) + 9])
+            for a, b in zip(x, y, strict=True)])
+    expected = sizes[7e5] - sizes[4e4]
+    found = [weighted_size(field.mixture_at(150, 150, flux=level).render(
+        (17, 17), 8, 8, pixel_integrated=field.pixel_integrated))
+        for level in (4e4, 7e5)]
+    row = field.brighter_fatter[0]
+    error = (row['xx_err'] + row['yy_err']) / (row['xx'] + row['yy'])
+    assert abs((found[1] - found[0]) / expected - 1) < max(4 * error, 0.15)
