@@ -203,9 +203,10 @@ def residual_section(path, table, record):
     return Section(
         f'Residuals: {path}', panels=tuple(panels), record=record,
         facts={'Detections': len(table),
-               'That anything can be said of': len(rows)},
-        text='Detections less the straight motions of their stars; those '
-             'left out are orange. Two detections always lie on a line.')
+               'Detections of stars with three or more': len(rows)},
+        text='Each arrow is a detection minus the fitted motion of its star; '
+             'rejected detections are orange. A star with two detections '
+             'has no residuals, because a line passes through both.')
 
 
 def _judged(table):
