@@ -22,8 +22,8 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     epoch : int
         Number of the epoch, from 0.
     scale : float, optional
-        Residual [mas] as long as a tenth of the field; the default is three
-        times the median residual.
+        Residual [mas] as long as a tenth of the field, which the key shows;
+        the default is three times the median residual.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw; None is pyplot's current Axes.
 
@@ -39,15 +39,20 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     good = np.isfinite(x + y + u + v)
     if scale is None:
         scale = 3 * np.median(np.hypot(u[good], v[good]))
-    width = np.ptp(x[good]) / 10
+    unit = scale / (np.ptp(x[good]) / 10)
     used = np.asarray(rows['used'])
     for which, colour in ((good & used, BLUE), (good & ~used, ORANGE)):
-        ax.quiver(x[which], y[which], u[which], v[which], color=colour,
-                  angles='xy', scale_units='xy', scale=scale / width)
-    ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal',
-           title=f'epoch {epoch}: a tenth of the field is {scale:.2g} '
-                 f'{rows["dra"].unit}')
+        arrows = ax.quiver(x[which], y[which], u[which], v[which],
+                           color=colour, angles='xy', scale_units='xy',
+                           scale=unit)
+    # The frame holds the tips, too.
+    ax.update_datalim(np.column_stack([x + u / unit, y + v / unit])[good])
+    ax.autoscale_view()
+    ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal')
+    ax.set_title(f'epoch {epoch}', loc='left')
     ax.invert_xaxis()
+    ax.quiverkey(arrows, 0.85, 1.04, scale, f'{scale:.2g} {rows["dra"].unit}',
+                 labelpos='W', color=BLUE)
     return ax
 
 
