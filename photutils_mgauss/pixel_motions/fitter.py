@@ -73,6 +73,10 @@ class PixelMotionFitter:
         What has a flux of its own: each image, each band, or nothing but
         the star. Fluxes in common make faint stars a little more precise;
         they need images of one scale and stars that do not vary.
+    reach : float, optional
+        How far from its given place and motion a faint star may be in each
+        image, in units of the FWHM of the PSF, unless the data are sure that
+        it is farther away. Bright stars are free.
 
     Examples
     --------
@@ -94,7 +98,7 @@ class PixelMotionFitter:
 
     def __init__(self, *, parallax=False, acceleration=False, references=None,
                  fit_shape=11, fit_sky=True, forced=False, executor=None,
-                 progress_bar=False, flux='image'):
+                 progress_bar=False, flux='image', reach=0.75):
         self.parallax = parallax
         self.acceleration = acceleration
         self.references = references
@@ -104,6 +108,7 @@ class PixelMotionFitter:
         self.executor = executor
         self.progress_bar = progress_bar
         self.flux = flux
+        self.reach = reach
         self._check()
 
     def __repr__(self):
@@ -217,7 +222,8 @@ class PixelMotionFitter:
         start = campaign.views(listed.values[:, None]).pixels
         solved = solve(campaign, listed.values,
                        as_shape(self.fit_shape, 'fit_shape'),
-                       forced=self.forced, executor=self.executor,
+                       reach=self.reach, forced=self.forced,
+                       executor=self.executor,
                        progress_bar=self.progress_bar)
         errors = errors_of(campaign, solved)
         if campaign.estimated:
@@ -241,6 +247,7 @@ class PixelMotionFitter:
 
     def _check(self):
         as_choice(self.flux, 'flux', FLUXES)
+        as_real(self.reach, 'reach', above=0)
         as_shape(self.fit_shape, 'fit_shape')
         for name in ('parallax', 'acceleration', 'fit_sky', 'forced',
                      'progress_bar'):
