@@ -20,6 +20,7 @@ from photutils_mgauss.pixel_motions.campaign import read_campaign
 from photutils_mgauss.pixel_motions.errors import (
     errors_of,
     frame_covariance,
+    with_psf_errors,
 )
 from photutils_mgauss.pixel_motions.find import BRIGHT, Grid, candidates
 from photutils_mgauss.pixel_motions.solution import PixelMotionSolution
@@ -220,14 +221,16 @@ class PixelMotionFitter:
     def _solve(self, campaign, listed):
         """Return the solution of the stars listed."""
         start = campaign.views(listed.values[:, None]).pixels
-        solved = solve(campaign, listed.values,
-                       as_shape(self.fit_shape, 'fit_shape'),
+        shape = as_shape(self.fit_shape, 'fit_shape')
+        solved = solve(campaign, listed.values, shape,
                        reach=self.reach, forced=self.forced,
                        executor=self.executor,
                        progress_bar=self.progress_bar)
         errors = errors_of(campaign, solved)
         if campaign.estimated:
             errors = _scaled(campaign, solved, errors)
+        errors = with_psf_errors(campaign, solved, errors, shape,
+                                 self.executor)
         if self.references is not None:
             errors = replace(errors, covariance=errors.covariance
                              + frame_covariance(self.references, campaign,

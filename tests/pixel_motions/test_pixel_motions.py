@@ -20,11 +20,15 @@ from helpers.moving_stars import (
 from helpers.star_images import MIXTURE
 from photutils_mgauss import (
     Epoch,
+    GaussianMixture,
+    GriddedMixturePSF,
+    MultiGaussianPSFModel,
     PixelMotionFitter,
     ProperMotionFitter,
     decode_motion_flags,
     fit_many,
 )
+from photutils_mgauss.psf.errors import PSFErrors
 
 YEARS = (2024.9, 2026.4, 2026.6, 2028.5)
 NAMES = ('ra', 'dec', 'pmra', 'pmdec')
@@ -300,6 +304,43 @@ def test_errors_of_frames_are_those_of_frames_that_move(rng):
         expected += 100 * change[4, :4]**2
     # Positions of all frames together are free: nothing is added there.
     assert_allclose(added[4], expected, rtol=0.05, atol=2e-3)
+
+
+def unsure_psf(change):
+    """Return the PSF, and one that is off by its one change."""
+    grid = GriddedMixturePSF([MIXTURE], [(0, 0)]).grid
+    known = PSFErrors(grid, change[None, None])
+    psf = GriddedMixturePSF._of_grid(grid, errors=known)
+    off = GaussianMixture(
+        MIXTURE.weights + change[:, 0], MIXTURE.means + change[:, 1:3],
+        MIXTURE.covariances + change[:, [3, 4, 4, 5]].reshape(-1, 2, 2))
+    return psf, MultiGaussianPSFModel(off)
+
+
+@pytest.mark.parametrize('same', [False, True])
+def test_errors_of_psfs_are_those_of_psfs_that_change(rng, same):
+    change = 1e-3 * np.array([[2, 8, -5, 3, 1, -2],
+                              [-2, 20, 10, -20, 5, 10.0]])
+    star = truth(30.2, 29.6)
+    images = observe(star, 5000.0, YEARS, rng)
+    one, off = unsure_psf(change)
+    unsure = [replace(image, psf=one if same else unsure_psf(change)[0])
+              for image in images]
+    start = star['id', 'ra', 'dec']
+    known, free = (PixelMotionFitter().fit(some, start).stars
+                   for some in (images, unsure))
+    expected, flux = np.zeros(4), np.zeros(len(images))
+    for changed in ([range(len(images))] if same else
+                    [[k] for k in range(len(images))]):
+        wrong = [replace(image, psf=off) if k in changed else image
+                 for k, image in enumerate(images)]
+        table = PixelMotionFitter().fit(wrong, start).stars
+        expected += (offsets(table, star) - offsets(known, star))[0, :4]**2
+        flux[changed] = (table['flux'] - known['flux'])[0, changed]
+    added = (errors(free)**2 - errors(known)**2)[0, :4]
+    assert_allclose(added, expected, rtol=0.1, atol=0.02 * expected.max())
+    more = free['flux_err'][0]**2 - known['flux_err'][0]**2
+    assert_allclose(more, flux**2, rtol=0.1)
 
 
 # What goes wrong.
