@@ -134,7 +134,7 @@ def frame_covariance(solution, campaign, solved, plain):
     fit = solution._fit
     epochs = _epochs_of(solution, campaign)
     frames, transform = fit.frames, fit.setup.transform
-    n, size = len(solved.values), frames.factor.shape[1]
+    size = frames.factor.shape[1]
     factor = frames.factor.reshape(len(solution.epochs), 2, -1, size)
     place = fit.setup.sightings.plane.project(
         campaign.plane.deproject(solved.values[:, :2].T))

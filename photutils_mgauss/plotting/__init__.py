@@ -25,6 +25,7 @@ from photutils_mgauss.plotting.grid import (
     plot_worst_node,
 )
 from photutils_mgauss.plotting.motions import (
+    plot_cutouts,
     plot_errors_by_epochs,
     plot_motion_errors,
     plot_proper_motions,
@@ -45,6 +46,7 @@ from photutils_mgauss.plotting.stars import (
 __all__ = [
     'plot_comparison',
     'plot_comparison_of_numbers',
+    'plot_cutouts',
     'plot_detections',
     'plot_ellipses',
     'plot_error_curve',

@@ -343,6 +343,27 @@ def test_errors_of_psfs_are_those_of_psfs_that_change(rng, same):
     assert_allclose(more, flux**2, rtol=0.1)
 
 
+def test_cutouts_are_the_pixels_around_a_star(rng):
+    stars = truth([30.2, 12.0], [29.6, 57.8])
+    images = observe(stars, [3000.0, 400.0], YEARS, rng)
+    solution = PixelMotionFitter().fit(images, stars['id', 'ra', 'dec'])
+    table = solution.cutouts(0, size=(7, 9))
+    x, y = np.rint([table['x'].value, table['y'].value]).astype(int)
+    sky = solution.fluxes['local_bkg'][:len(images)]
+    for k, image in enumerate(images):
+        box = slice(y[k] - 3, y[k] + 4), slice(x[k] - 4, x[k] + 5)
+        assert_allclose(table['data'][k], image.data[box] - sky[k])
+        assert_allclose(table['model'][k], solution.model(k)[box],
+                        atol=0.02)
+    assert_allclose(table['residual'], table['data'] - table['model'])
+    assert abs(table['residual'].std() - 3) < 0.4
+    faint = solution.cutouts()
+    assert faint.meta['ID'] == 1
+    assert np.isnan(faint['data']).any()
+    with pytest.raises(ValueError, match='star must be'):
+        solution.cutouts(7)
+
+
 # What goes wrong.
 
 def fit_with_notes(images, stars, **options):
