@@ -28,9 +28,8 @@ from photutils_mgauss.photometry.engine import cut_boxes
 
 _MAX_STEPS = 60
 
-# Of the next step [pix], as for single images, or in standard errors.
+# Of the next step [pix], as for single images.
 TOLERANCE = 1e-6
-_SMALL = 1e-10
 
 # Of the data, what chi2 may rise by for nothing.
 _ROUNDING = 1e-14
@@ -234,6 +233,8 @@ class JointFit:
         Which parameters are fitted.
     own : (g, E, m, 3) `~numpy.ndarray` or None
         Light of the stars that the images are without.
+    least_gain : float
+        A step that promises to lower chi2 by less is the last.
     """
 
     joint: JointImages
@@ -241,6 +242,7 @@ class JointFit:
     boxes: np.ndarray
     free: np.ndarray
     own: np.ndarray | None = None
+    least_gain: float = 1e-10
 
     def evaluate(self, values, rows):
         """Return the `State` of some groups (r,) at values (r, m, p)."""
@@ -289,7 +291,8 @@ class JointFit:
         length = np.abs(shift).max(axis=(1, 2, 3))
         # No star moves farther than a pixel at a time.
         step *= np.minimum(1, 1 / np.maximum(length, 1e-300))[:, None]
-        return step, (length < TOLERANCE) | (promised < _SMALL)
+        return step, (length < TOLERANCE) | (
+            promised < self.least_gain)
 
     def scores(self, values, rows):
         """

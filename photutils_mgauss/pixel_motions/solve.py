@@ -37,6 +37,9 @@ _MOST = 6
 _ROUNDS = 8
 _SETTLED = 0.03
 
+# What chi2 a last step may be worth: a thousandth of a standard error.
+_LEAST_GAIN = 1e-6
+
 # The WCS counts as a linear map as far as this [pix].
 _LINEAR = 0.5
 
@@ -290,7 +293,7 @@ def _piece(fit, region, rows):
 def _run(joint, piece):
     """Return the state of a piece, who converged, and the spread."""
     region, *rest = piece
-    fit = JointFit(joint, *rest)
+    fit = JointFit(joint, *rest, least_gain=_LEAST_GAIN)
     state, done = fit.minimize()
     n, m, p = state.values.shape
     spread = np.full((n, p, p), np.nan)
