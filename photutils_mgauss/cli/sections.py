@@ -179,6 +179,7 @@ def motion_section(path, table, record):
                           if 'reference' in table.colnames else '')
     free = np.asarray(table['reference']) == ''
     facts['References'] = int(np.sum(~free))
+    facts |= _gain(record.get('catalogues', {}), unit)
     for name in ('pmra', 'pmdec'):
         values = column_values(table, f'{name}_error')[solved]
         if values.size:
@@ -207,6 +208,19 @@ def _motion_verdict(table, solved, free):
         f'{words}; residuals are {middle:.2f} times the stated errors')
 
 
+def _gain(catalogues, unit):
+    """Return facts on what catalogues gave of the same exposures."""
+    facts = {}
+    if catalogues:
+        facts['With proper motions from catalogues'] = catalogues['motions']
+    if catalogues.get('both'):
+        facts['Stars with motions from both'] = catalogues['both']
+        for way in ('catalogues', 'pixels'):
+            facts[f'Median error of these from {way} [{unit}]'] = (
+                f'{catalogues["median_error_" + way]:.3f}')
+    return facts
+
+
 def _motion_panels(table, solved, free):
     panels = [Panel(lambda ax: plotting.plot_proper_motions(
         table[solved], ax=ax), 'The proper motions.')]
@@ -226,6 +240,20 @@ def _motion_panels(table, solved, free):
                 label='-2.5 log10(flux)', ax=ax),
             'Errors of the motions of stars against magnitude.'))
     return tuple(panels)
+
+
+def cutout_section(path, table, record):
+    """Return the section on what all images show of one star."""
+    facts = {'Images': len(table)}
+    if len(table):
+        facts |= {'Star': table.meta['ID'], 'Signal to noise in all images':
+                  f'{table.meta["SIGNIF"]:.1f}'}
+    panels = (Panel(lambda ax: plotting.plot_cutouts(table, ax=ax),
+                    'Each image, what the fit makes of it, and the rest.'),
+              ) if len(table) else ()
+    return Section(f'A faint star: {path}', facts=facts, panels=panels,
+                   text='The faintest star with a motion, as all images show '
+                        'it.', record=record)
 
 
 def alignment_section(path, table, record):
@@ -305,6 +333,7 @@ def _judged(table):
 
 # The columns that tell a table, and what is said of it.
 _TABLES = (({'pmra', 'pmra_error'}, motion_section),
+           ({'image', 'data', 'model', 'residual'}, cutout_section),
            ({'dra', 'ddec', 'epoch'}, residual_section),
            ({'epoch', 'shift', 'matrix'}, alignment_section),
            ({'x_fit', 'y_fit', 'flux_fit'}, catalogue_section))

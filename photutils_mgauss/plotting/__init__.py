@@ -28,6 +28,7 @@ from photutils_mgauss.plotting.grid import (
     plot_worst_node,
 )
 from photutils_mgauss.plotting.motions import (
+    plot_cutouts,
     plot_errors_by_epochs,
     plot_motion_errors,
     plot_proper_motions,
@@ -51,6 +52,7 @@ __all__ = [
     'plot_comparison',
     'plot_comparison_of_numbers',
     'plot_corner',
+    'plot_cutouts',
     'plot_detections',
     'plot_ellipses',
     'plot_error_curve',
