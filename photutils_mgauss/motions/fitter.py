@@ -51,10 +51,13 @@ class ProperMotionFitter:
         makes all motions relative to the mean of the stars.
     ref_epoch : `~astropy.time.Time` or float, optional
         Epoch of the positions; the default is the mean time of the epochs.
-    systematic : {'fit', None} or `~astropy.units.Quantity`, optional
+    systematic : {'fit', 'magnitude', None} or Quantity, optional
         Error added in quadrature to each axis of every detection of an
         epoch: found from the scatter of the references, none, or given (one
-        value, or one for each epoch).
+        value, or one for each epoch). 'magnitude' also multiplies the errors
+        of each epoch by a smooth function of the magnitude, found from the
+        scatter of all stars: for lists whose errors are too small for some
+        stars and too large for others.
     executor : `~concurrent.futures.Executor`, optional
         Where the work is done; the default is threads on all processors.
     match_by : {'auto', 'id', 'sky', 'pattern'}, optional
@@ -234,5 +237,5 @@ def _systematic(value):
     if value is None:
         return None
     if isinstance(value, str):
-        return as_choice(value, 'systematic', ('fit',))
+        return as_choice(value, 'systematic', ('fit', 'magnitude'))
     return _check_quantity(value, 'systematic', u.mas, u.pix)
