@@ -2,9 +2,14 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from astropy.table import QTable
 from scipy.special import chdtri, ndtr
 
-from photutils_mgauss.motions.chip_maps import reduce_chips, without_chips
+from photutils_mgauss.motions.chip_maps import (
+    chip_covariance,
+    reduce_chips,
+    without_chips,
+)
 from photutils_mgauss.motions.error_scale import fit_error_scales
 from photutils_mgauss.motions.frames import (
     Frames,
@@ -29,6 +34,7 @@ from photutils_mgauss.motions.stacked import (
     invert_2x2,
     variance_2x2,
 )
+from photutils_mgauss.motions.terms import Terms, chosen_terms, terms_table
 
 CONVERGED = 1e-3  # of the median error of a detection
 MAX_ITERATIONS = 40
@@ -184,15 +190,9 @@ def _align(setup, state):
 
 def fit(setup, state):
     """Return the `Fit` of a setup: align, reject, estimate the floors."""
-    for _ in range(MAX_ITERATIONS):
-        problem, frames, state = _align(setup, state)
-        if setup.options.clip is None:
-            break
-        state, changed = _review(setup, state, problem, frames)
-        if not changed:
-            break
-    else:
-        state = replace(state, unfinished=True)
+    if setup.terms is not None:
+        setup, state = _with_terms(setup, state)
+    problem, frames, state = _cleaned(setup, state)
     rounds = 12 if setup.options.scales_errors else 4
     for i in range(rounds * setup.options.fits_floor):
         after = _systematics(setup, state, problem, frames, anew=i == 0)
@@ -206,6 +206,43 @@ def fit(setup, state):
                                                setup.options)
         state = replace(state, maps=state.maps - common)
     return finished(setup, state, problem, frames, estimates)
+
+
+def _with_terms(setup, state):
+    """Return setup and state with the terms that are real, to begin with."""
+    problem, _, after = _cleaned(setup, state)
+    kinds = chosen_terms(problem, setup.terms, setup.options.executor)
+    if not kinds:
+        return replace(setup, terms=None), state
+    terms = setup.terms.only(kinds)
+    return replace(setup, terms=None, distortion=terms), replace(
+        state, maps=after.maps, floor=after.floor, distortion=terms.none())
+
+
+def _cleaned(setup, state):
+    """Return problem, frames and state with all outliers rejected."""
+    for _ in range(MAX_ITERATIONS):
+        problem, frames, state = _align(setup, state)
+        if setup.options.clip is None:
+            break
+        state, changed = _review(setup, state, problem, frames)
+        if not changed:
+            break
+    else:
+        state = replace(state, unfinished=True)
+    return problem, frames, state
+
+
+def fitted_terms(result):
+    """Return the table of the terms of a `Fit`."""
+    setup, terms = result.setup, result.setup.distortion
+    if not isinstance(terms, Terms):
+        return QTable(names=('epoch', 'term', 'dx', 'dy'),
+                      dtype=(int, 'U9', float, float))
+    coefficients = result.state.distortion
+    chips = reduce_chips(result.problem, terms, coefficients)
+    return terms_table(terms, coefficients, chip_covariance(
+        chips, result.frames.factor), setup.sightings.epoch_years)
 
 
 def measured_alone(result):

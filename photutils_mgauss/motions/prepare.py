@@ -16,6 +16,7 @@ from photutils_mgauss.motions.priors import (
     build_priors,
 )
 from photutils_mgauss.motions.stacked import variance_2x2
+from photutils_mgauss.motions.terms import Terms, terms_of
 from photutils_mgauss.sky.transforms import Transform
 from photutils_mgauss.utils.validation import as_rng
 
@@ -38,6 +39,7 @@ class Options:
     executor: object
     distortion: Transform
     distortion_prior: u.Quantity
+    terms: tuple
 
     @property
     def n_star_parameters(self):
@@ -95,7 +97,9 @@ class Setup:
     magnitudes : (E, n) `~numpy.ndarray` or None
         Of the detections, if something depends on them.
     distortion : `~photutils_mgauss.motions.chips.Distortion` or None
-        Of the chips of cameras, if there are any.
+        Of the chips of cameras, if there are any, or the terms in use.
+    terms : `~photutils_mgauss.motions.terms.Terms` or None
+        Those asked for, until it is known which are real.
     """
 
     sightings: Sightings
@@ -115,6 +119,7 @@ class Setup:
     typical_variance: float
     magnitudes: np.ndarray | None
     distortion: Distortion | None
+    terms: Terms | None
 
     def undistorted(self, state):
         """Return the places (2, E, n) with the distortion of chips gone."""
@@ -181,19 +186,35 @@ def prepare(sightings, options):
                                     options.parallax_prior)
     variance = variance_2x2(sightings.covariance[:, sightings.usable])
     maps = np.repeat(transform.identity()[None], len(dt), axis=0)
-    brightness = (magnitudes_of(sightings) if options.scales_errors
-                  else None)
+    brightness = (magnitudes_of(sightings)
+                  if options.scales_errors or options.terms else None)
+    typical = np.median(variance) if variance.size else 1.0
     distortion = distortion_of(sightings, pixels, options.distortion,
                                options.distortion_prior.to_value(u.mas))
+    terms = _terms(sightings, options, brightness, distortion, typical)
     return (Setup(sightings, options, transform, origin, working, dt, priors,
                   places, anchors, held, relative, drift, nearing, notes,
-                  np.median(variance) if variance.size else 1.0, brightness,
-                  distortion),
+                  typical, brightness, distortion, terms),
             State(maps, sightings.usable.copy(), floor,
                   np.empty(0, dtype=int), untied,
                   np.zeros((2, len(dt), len(nearing.stars))),
                   np.zeros(len(anchors), dtype=bool),
                   distortion=distortion and distortion.none()))
+
+
+def _terms(sightings, options, brightness, distortion, typical):
+    """Return the `Terms` asked for, None if there are none."""
+    if not options.terms:
+        return None
+    if distortion is not None:
+        msg = ('distortion must be None for terms of epochs of chips, got '
+               f'{options.distortion.kind!r}: one fit finds either of them')
+        raise ValueError(msg)
+    if options.transform.kind == 'none' or options.recipe == 'paper':
+        msg = ('terms need maps between the epochs: give a transform, and '
+               "the recipe 'joint' or 'two-step'")
+        raise ValueError(msg)
+    return terms_of(sightings, options.terms, brightness, np.sqrt(typical))
 
 
 def magnitudes_of(sightings):
@@ -206,7 +227,7 @@ def magnitudes_of(sightings):
                                    for epoch in sightings.epochs])
     if not np.isfinite(each).any():
         msg = ('epochs must have a column of magnitudes or fluxes (mag or '
-               "flux_fit) for systematic='magnitude', got none")
+               "flux_fit) for systematic='magnitude' and terms, got none")
         raise ValueError(msg)
     with warnings.catch_warnings():
         # Stars without a magnitude.
