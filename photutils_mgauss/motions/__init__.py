@@ -13,8 +13,9 @@ changes: a `problem` is solved for all stars and frames at once by `joint` and
 what nothing else does, `chips` are those of cameras, `chip_maps` solves for
 their distortions, `terms` depend on magnitude, colour and row, `error_scale`
 makes errors right at every magnitude, `paper_recipe` is the recipe of the
-paper. `solution` is what comes back: its parts are `propagation`, `corrected_epochs`, `tables`,
-`bootstrap`, and `doubts`, what speaks against it. Nothing here knows of pixels
+paper. `solution` is what comes back: its parts are `propagation`,
+`corrected_epochs`, `tables`, `bootstrap`, and `doubts`, what speaks against
+it; `membership` says which stars move together. Nothing here knows of pixels
 beyond a position and its covariance.
 """
 from photutils_mgauss.utils.lazy import hand_on
