@@ -4,6 +4,7 @@ import numpy as np
 from photutils_mgauss.plotting.style import BLUE, ORANGE, current_axes
 
 __all__ = [
+    'plot_cutouts',
     'plot_errors_by_epochs',
     'plot_motion_errors',
     'plot_proper_motions',
@@ -22,8 +23,8 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     epoch : int
         Number of the epoch, from 0.
     scale : float, optional
-        Residual [mas] as long as a tenth of the field; the default is three
-        times the median residual.
+        Residual [mas] as long as a tenth of the field, which the key shows;
+        the default is three times the median residual.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw; None is pyplot's current Axes.
 
@@ -39,15 +40,20 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     good = np.isfinite(x + y + u + v)
     if scale is None:
         scale = 3 * np.median(np.hypot(u[good], v[good]))
-    width = np.ptp(x[good]) / 10
+    unit = scale / (np.ptp(x[good]) / 10)
     used = np.asarray(rows['used'])
     for which, colour in ((good & used, BLUE), (good & ~used, ORANGE)):
-        ax.quiver(x[which], y[which], u[which], v[which], color=colour,
-                  angles='xy', scale_units='xy', scale=scale / width)
-    ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal',
-           title=f'epoch {epoch}: a tenth of the field is {scale:.2g} '
-                 f'{rows["dra"].unit}')
+        arrows = ax.quiver(x[which], y[which], u[which], v[which],
+                           color=colour, angles='xy', scale_units='xy',
+                           scale=unit)
+    # The frame holds the tips, too.
+    ax.update_datalim(np.column_stack([x + u / unit, y + v / unit])[good])
+    ax.autoscale_view()
+    ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal')
+    ax.set_title(f'epoch {epoch}', loc='left')
     ax.invert_xaxis()
+    ax.quiverkey(arrows, 0.85, 1.04, scale, f'{scale:.2g} {rows["dra"].unit}',
+                 labelpos='W', color=BLUE)
     return ax
 
 
@@ -162,3 +168,66 @@ def plot_errors_by_epochs(solutions, *, ax=None):
     ax.set(xlabel='number of epochs', ylabel=f'median error [{unit}]')
     ax.legend()
     return ax
+
+
+def plot_cutouts(cutouts, *, ax=None):
+    """
+    Draw what each image shows of one star: data, model and residual.
+
+    Parameters
+    ----------
+    cutouts : `~astropy.table.QTable`
+        As `~photutils_mgauss.PixelMotionSolution.cutouts` returns it.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        Its Axes: a column for each image, grey from -2 to 5 times the
+        scatter of the residuals in it. Crosses are where the fit has the
+        star.
+
+    Raises
+    ------
+    ValueError
+        If the table has no rows.
+    """
+    if not len(cutouts):
+        msg = 'cutouts must have at least one row, got none'
+        raise ValueError(msg)
+    ax = current_axes(ax)
+    parts = ('data', 'model', 'residual')
+    stamps = np.stack([_plain(cutouts[name]) for name in parts])
+    _, n, ny, nx = stamps.shape
+    # Images of different depth are shown alike.
+    noise = 1.4826 * np.nanmedian(np.abs(stamps[2]), axis=(1, 2))
+    stamps = stamps / np.where(noise > 0, noise, 1)[:, None, None]
+    picture = np.full((3 * (ny + 1) - 1, n * (nx + 1) - 1), np.nan)
+    for i in range(3):
+        for k in range(n):
+            top, left = (2 - i) * (ny + 1), k * (nx + 1)
+            picture[top:top + ny, left:left + nx] = stamps[i, k]
+    ax.imshow(picture, origin='lower', cmap='gray_r', vmin=-2, vmax=5,
+              interpolation='nearest')
+    _mark_star(ax, cutouts, (ny, nx))
+    ax.set_xticks((nx + 1) * np.arange(n) + (nx - 1) / 2,
+                  [f'{year:.2f}' for year in _plain(cutouts['time'])])
+    ax.set_yticks((ny + 1) * np.arange(3) + (ny - 1) / 2, parts[::-1])
+    ax.tick_params(length=0)
+    ax.set(xlabel='year')
+    return ax
+
+
+def _mark_star(ax, cutouts, shape):
+    """Mark the place of the star in all stamps."""
+    ny, nx = shape
+    x, y = _plain(cutouts['x']), _plain(cutouts['y'])
+    columns = (nx + 1) * np.arange(len(x)) + (nx - 1) // 2 + x - np.rint(x)
+    for i in range(3):
+        ax.plot(columns, (ny + 1) * i + (ny - 1) // 2 + y - np.rint(y), '+',
+                color=ORANGE, markersize=4, markeredgewidth=0.7)
+
+
+def _plain(column):
+    return np.asarray(getattr(column, 'value', column), float)
