@@ -202,7 +202,8 @@ def shape_covariance(covariance, unmodelled, basis):
     return np.einsum('nptq,nt->npq', half, basis) + np.diag(unmodelled)
 
 
-def psf_errors(at, covariance, unmodelled, degree, shape, integrated):
+def psf_errors(at, covariance, unmodelled, degree, shape, integrated,
+               misfit=0.0):
     """
     Return the errors of a field's PSF.
 
@@ -217,6 +218,8 @@ def psf_errors(at, covariance, unmodelled, degree, shape, integrated):
         Of the detector.
     integrated : bool
         Whether the mixtures are to be integrated over pixels.
+    misfit : float, optional
+        By what share of it the light in pixels is off.
 
     Returns
     -------
@@ -234,7 +237,7 @@ def psf_errors(at, covariance, unmodelled, degree, shape, integrated):
     grid = Grid(*axes, *mixtures, np.ones(x.size))
     found = shape_covariance(covariance, unmodelled, basis)
     return PSFErrors(grid, _directions(PSFErrors(grid, every), found,
-                                       integrated))
+                                       integrated), misfit)
 
 
 def _slopes(at, x, y, step):

@@ -305,7 +305,8 @@ class MixtureField(Field):
             lambda x, y, change: (self._basis(x, y), *self._mixtures(
                 x, y, exposure, change)[:3]),
             self.covariance, unmodelled, self.degree, self.shape,
-            self.pixel_integrated)
+            self.pixel_integrated,
+            self.accuracy if self.pixel_integrated else 0.0)
 
     def _blur(self, exposure):
         n = 1 if self.exposures is None else len(self.exposures)

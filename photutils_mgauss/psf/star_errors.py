@@ -3,8 +3,9 @@ Errors of stars beyond those of independent pixels.
 
 What a star's fit makes of an error of its PSF, :math:`f\,\delta P_r`, is
 :math:`f (J^T W J)^{-1} J^T W\, \delta P_r`; the sum of the squares over the
-directions r is the PSF's part of the star's covariance. Where the noise of
-pixels is correlated, with the matrix R of correlations, the covariance is
+directions r is the PSF's part of the star's covariance, together with what
+light in the wrong pixels does. Where the noise of pixels is correlated, with
+the matrix R of correlations, the covariance is
 
 .. math::
 
@@ -170,6 +171,9 @@ class StarPixels:
         n_free = self.free.size
         shifts = shifts[:, :n_free]
         psf = shifts @ shifts.transpose(0, 2, 1)
+        if self.psf.misfit:
+            psf += self.psf.misfit**2 * _answer(
+                design, inverse, weight, images[:, 0])[:, :n_free, :n_free]
         units = np.where(self.free == 0, flux[:, None], 1.0)
         psf *= units[:, :, None] * units[:, None]
         if matrix is None:
@@ -207,6 +211,18 @@ class StarPixels:
         usable = (inside.reshape(light.shape) & (variance > 0)
                   & np.isfinite(variance))
         return np.where(usable, 1 / np.where(usable, variance, 1), 0)
+
+
+def _answer(design, inverse, weight, light):
+    """
+    Return the covariances of fits to pixels that are off by their light.
+
+    No light is lost: what is missing in one pixel is in the others.
+    """
+    moved = inverse @ (design * (weight * light)[:, None])
+    total = light.sum(axis=1)[:, None, None]
+    moved -= moved.sum(axis=2, keepdims=True) * light[:, None] / total
+    return moved @ moved.transpose(0, 2, 1)
 
 
 def _growth(design, inverse, root, matrix, n_free):
