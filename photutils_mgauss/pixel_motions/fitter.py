@@ -156,7 +156,7 @@ class PixelMotionFitter:
         return solution
 
     def find(self, images, stars=None, *, max_motion=None,
-             false_alarm=1e-5):
+             max_parallax=None, false_alarm=1e-5):
         """
         Look for stars in the evidence of all images together.
 
@@ -170,6 +170,9 @@ class PixelMotionFitter:
         max_motion : `~astropy.units.Quantity`, optional
             The largest motion along each axis that is searched; by default
             that of 0.1 pixels an epoch. Time grows with its square.
+        max_parallax : `~astropy.units.Quantity`, optional
+            The largest parallax that is searched, with ``parallax=True``;
+            by default none is. Parallaxes below half a pixel need no search.
         false_alarm : float, optional
             How often noise may be taken for a star, at each independent
             place.
@@ -188,10 +191,15 @@ class PixelMotionFitter:
         """
         self._check()
         as_real(false_alarm, 'false_alarm', above=0, maximum=0.5)
-        if max_motion is not None:
-            max_motion = _as_motion(max_motion)
+        largest = [None if value is None else _as_plain(value, name, unit)
+                   for value, name, unit in (
+                       (max_motion, 'max_motion', u.mas / u.yr),
+                       (max_parallax, 'max_parallax', u.mas))]
+        if max_parallax is not None and not self.parallax:
+            msg = 'max_parallax must be given with parallax=True only'
+            raise ValueError(msg)
         campaign = self._read(images, stars)
-        look = partial(candidates, campaign, max_motion,
+        look = partial(candidates, campaign, (largest[0], largest[1] or 0.0),
                        executor=self.executor)
         known = ([] if stars is None else
                  [self._solve(campaign, read_stars(stars, campaign))])
@@ -294,15 +302,15 @@ def _apart(campaign, faint, bright):
     return faint[away > 0.7 * radius]
 
 
-def _as_motion(value):
-    """Return a motion in mas / yr, or raise."""
+def _as_plain(value, name, unit):
+    """Return a Quantity as a number of a unit, or raise."""
     try:
-        value = u.Quantity(value, u.mas / u.yr)
+        value = u.Quantity(value, unit)
     except (TypeError, u.UnitConversionError) as error:
-        msg = (f'max_motion must be a Quantity like mas / yr, got '
+        msg = (f'{name} must be a Quantity like {unit}, got '
                f'{value!r:.80}')
         raise TypeError(msg) from error
-    return as_real(float(value.value), 'max_motion', minimum=0)
+    return as_real(float(value.value), name, minimum=0)
 
 
 def _scaled(campaign, solved, errors):

@@ -494,3 +494,27 @@ def test_stars_too_faint_for_each_image_are_found_in_all(rng):
     assert len(np.unique(nearest[right])) > 0.9 * x.size
     more = PixelMotionFitter().find(images, stars['ra', 'dec'])
     assert len(more) <= 1
+
+
+def test_near_stars_are_found_if_parallaxes_are_searched(rng):
+    # Far apart in time by half a year the parallax is as large as it gets.
+    years = 2024.2 + 0.5 * np.arange(6)
+    stars = truth([22.0, 48.0], [24.0, 50.0], parallax=200.0)
+    flux = 4.0 * 3.0 / np.sqrt(np.sum(MIXTURE.render((21, 21), 10, 10)**2))
+    images = observe(stars, flux, years, rng, size=72)
+    place = SkyCoord(stars['ra'], stars['dec'])
+
+    def near(table):
+        return 0 if not len(table) else int((place.match_to_catalog_sky(
+            SkyCoord(table['ra'], table['dec']))[1] < 60 * u.mas).sum())
+
+    fitter = PixelMotionFitter(parallax=True)
+    found = fitter.find(images, max_parallax=300 * u.mas)
+    assert near(found) == 2
+    away = found['parallax'] - 200 * u.mas
+    assert (np.abs(away / found['parallax_error']) < 4).sum() >= 2
+    assert near(fitter.find(images)) < 2
+    with pytest.raises(ValueError, match='parallax=True only'):
+        PixelMotionFitter().find(images, max_parallax=300 * u.mas)
+    with pytest.raises(TypeError, match='max_parallax must be'):
+        fitter.find(images, max_parallax=3 * u.s)
