@@ -116,10 +116,10 @@ class CrowdedMixturePhotometry:
         fitted along with the others for the sake of these. They are not
         reported.
     count_slope : float, optional
-        What is known beforehand of the flux of a found star: numbers of
-        stars fall with it to this negative power. Bright stars do not feel
-        it; of light that could be of either, a faint star takes less. Zero
-        is no knowledge.
+        The prior of the flux of a found star: the number of stars per unit
+        flux falls with this power of the flux. Fluxes of bright stars stay
+        the same; where two stars share light, the fainter one gets less of
+        it. 0 is no prior.
     background_size : float or None, optional
         The distance of the nodes of the bilinear background [pix], or None
         if there is no background to fit.

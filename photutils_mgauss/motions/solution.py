@@ -11,7 +11,11 @@ from astropy.utils.exceptions import AstropyUserWarning
 from photutils_mgauss.motions.bootstrap import bootstrap_frames
 from photutils_mgauss.motions.corrected_epochs import correct_epochs
 from photutils_mgauss.motions.doubts import doubts, remarks
-from photutils_mgauss.motions.loop import Fit, measured_alone
+from photutils_mgauss.motions.loop import (
+    Fit,
+    fitted_terms,
+    measured_alone,
+)
 from photutils_mgauss.motions.propagation import (
     propagated,
     star_covariance,
@@ -154,6 +158,20 @@ class MotionSolution:
         chi-square (of two degrees of freedom, leverage taken into account).
         """
         return residual_table(self._fit)
+
+    @cached_property
+    def terms(self):
+        """
+        The terms that cross-validation confirmed, as a table.
+
+        One row for each function of each epoch, a `~astropy.table.QTable`:
+        what is to be added to x and y of a detection [pix] (of epochs in
+        the sky, in their units) is ``dx``, ``dy`` times powers (``powers``)
+        of magnitude, colour and row. The former are scaled by the middle
+        and half range in ``meta``, within -1.5 and 1.5, the row by ``rows``.
+        No rows where there are no terms.
+        """
+        return fitted_terms(self._fit)
 
     @property
     def sky(self):
