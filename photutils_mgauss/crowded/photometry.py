@@ -34,6 +34,9 @@ __all__ = ['CrowdedMixturePhotometry', 'UnfinishedTilesError']
 
 # A PSF whose size is off by more than this fraction is warned of.
 _WIDTH_TOLERANCE = 0.1
+_CONFUSION = ('errors and fluxes allow for stars that were not found; what of '
+              'their light the background takes is calibrated with artificial '
+              'stars')
 # Stars are drawn out to where this fraction of the noise is left of them.
 _FAINTEST = 1e-3
 
@@ -152,6 +155,10 @@ class CrowdedMixturePhotometry:
         Whether the errors contain what the PSF may be off, if ``psf_model``
         knows that, as the grid of a `MixtureField` does; see
         `MixturePSFPhotometry`. Each star is taken by itself for this.
+    confusion : bool, optional
+        Whether errors and fluxes allow for stars that are too faint or too
+        close to others to be found, in the number that the stars around tell.
+        Not where ``find_neighbors`` is False: then a list has all stars.
     find_neighbors : bool, optional
         Whether stars that are missing from a given list are found and fitted
         together with those on it. They are not reported. Otherwise the list
@@ -180,7 +187,10 @@ class CrowdedMixturePhotometry:
     -----
     Columns beside photutils' own: ``xy_cov``, the covariance of x and y
     [pix^2]; ``x_psf_err``, ``y_psf_err`` and ``flux_psf_err``, the part of the
-    errors that is due to the PSF, if it is known; ``significance`` of the
+    errors that is due to the PSF, if it is known; ``x_confusion_err``,
+    ``y_confusion_err`` and ``flux_confusion_err``, that of stars that were not
+    found, and ``flux_confusion``, what of their light has been taken off
+    ``flux_fit``; ``significance`` of the
     detection; ``crowding``, the star's share of the light of all stars in its
     fit pixels; ``neighbor_distance`` [pix] and ``neighbor_correlation``, the
     correlation with the nearest neighbour's flux; ``iter_detected``. Bits of
@@ -220,7 +230,7 @@ class CrowdedMixturePhotometry:
                  effective_gain=None, maxiters=3, tile_shape=None,
                  overlap=128, executor=None, progress_bar=False,
                  find_neighbors=True, xy_bounds=1.0, checkpoint=None,
-                 psf_errors=True):
+                 psf_errors=True, confusion=True):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
         self.keep = as_real(keep, 'keep', minimum=0)
@@ -251,6 +261,7 @@ class CrowdedMixturePhotometry:
         self.results = self.field = None
         self._noise = np.inf
         self.psf_errors = bool(psf_errors)
+        self.confusion = bool(confusion)
         self.psf_used = psf_model
         self._psf = None if psf_model is None else LocalPSF.of(psf_model)
 
@@ -340,7 +351,8 @@ class CrowdedMixturePhotometry:
         same = {name: getattr(self, name) for name in (
             'count_slope', 'background_size', 'maxiters', 'tile_shape',
             'overlap', 'executor', 'checkpoint')}
-        return type(self)(psf_model, psf_errors=False, **same | changes)
+        return type(self)(psf_model, psf_errors=False, confusion=False,
+                          **same | changes)
 
     def _listed(self, init_params, unit):
         x, y, flux, number = _given(init_params, unit)
@@ -365,7 +377,8 @@ class CrowdedMixturePhotometry:
             noise=float(np.sqrt(np.median(variance))),
             max_rounds=self.maxiters, find_neighbors=self.find_neighbors,
             xy_bounds=self._bound,
-            depth=self.depth, count_slope=self.count_slope)
+            depth=self.depth, count_slope=self.count_slope,
+            confusion=self.confusion)
 
     def _table(self, outcomes, given, unit):
         """Put the stars of the tiles together; empties the list."""
@@ -379,7 +392,9 @@ class CrowdedMixturePhotometry:
             stars = _in_given_order(stars, given)
         else:
             stars.sort('y', 'x')
-        return as_qtable(stars, unit, meta)
+        if self.confusion:
+            meta['confusion'] = _CONFUSION
+        return as_qtable(stars, unit, meta, confusion=self.confusion)
 
     def _report(self, done, stars):
         widths = np.concatenate([o.widths for o in done]) if done else []
