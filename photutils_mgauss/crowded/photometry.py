@@ -27,6 +27,7 @@ from photutils_mgauss.utils.checkpoint import Checkpoint
 from photutils_mgauss.utils.flags import REPEATED, decode
 from photutils_mgauss.utils.image import read_pixels, with_unit
 from photutils_mgauss.utils.per_thread import PerThread, keep
+from photutils_mgauss.utils.saturation import as_saturation, without_saturated
 from photutils_mgauss.utils.star_columns import column_values, read_sources
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
@@ -159,6 +160,11 @@ class CrowdedMixturePhotometry:
         Whether errors and fluxes allow for stars that are too faint or too
         close to others to be found, in the number that the stars around tell.
         Not where ``find_neighbors`` is False: then a list has all stars.
+    saturation : float or `~astropy.units.Quantity`, optional
+        The level from which pixels are saturated, in the unit of the data.
+        If given, such pixels are masked, with the trails along rows and
+        columns that their charge has run into and a pixel around them. Stars
+        behind masked pixels are fitted to their wings in any case.
     find_neighbors : bool, optional
         Whether stars that are missing from a given list are found and fitted
         together with those on it. They are not reported. Otherwise the list
@@ -230,7 +236,7 @@ class CrowdedMixturePhotometry:
                  effective_gain=None, maxiters=3, tile_shape=None,
                  overlap=128, executor=None, progress_bar=False,
                  find_neighbors=True, xy_bounds=1.0, checkpoint=None,
-                 psf_errors=True, confusion=True):
+                 psf_errors=True, confusion=True, saturation=None):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
         self.keep = as_real(keep, 'keep', minimum=0)
@@ -262,6 +268,7 @@ class CrowdedMixturePhotometry:
         self._noise = np.inf
         self.psf_errors = bool(psf_errors)
         self.confusion = bool(confusion)
+        self.saturation = as_saturation(saturation)
         self.psf_used = psf_model
         self._psf = None if psf_model is None else LocalPSF.of(psf_model)
 
@@ -298,7 +305,8 @@ class CrowdedMixturePhotometry:
         UnfinishedTilesError
             If a worker failed; the finished tiles are in the error.
         """
-        image = read_pixels(data, error, mask).with_error()
+        image = without_saturated(read_pixels(data, error, mask),
+                                  self.saturation).with_error()
         given = (None if init_params is None
                  else self._listed(init_params, image.unit))
         psf = self._psf_of(image)
@@ -350,7 +358,7 @@ class CrowdedMixturePhotometry:
         """Return the same photometry with a PSF and other settings."""
         same = {name: getattr(self, name) for name in (
             'count_slope', 'background_size', 'maxiters', 'tile_shape',
-            'overlap', 'executor', 'checkpoint')}
+            'overlap', 'executor', 'checkpoint', 'saturation')}
         return type(self)(psf_model, psf_errors=False, confusion=False,
                           **same | changes)
 

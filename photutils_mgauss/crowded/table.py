@@ -178,12 +178,20 @@ def _flags(tile, quality, error, correlation):
             (NOT_SEEN, s.listed & ~(s.flux > tile.options.keep
                                     * error[:, 0])),
             (NO_COVARIANCE, ~np.isfinite(error).all(axis=1)),
-            (SATURATED, (quality[:, 5] < 0.5)),
+            (SATURATED, (quality[:, 5] < 0.5) | _is_hidden(tile.model)),
             (NOT_A_STAR, (smooth_light(tile.model)
                           | _unlike_a_star(s.flux, quality))),
             (BLENDED, np.abs(correlation) > _BLEND_CORRELATION)):
         flags[where] |= bit
     return flags
+
+
+def _is_hidden(model):
+    """Tell which stars started from their wings and have no middle pixel."""
+    s, (ny, nx) = model.stars, model.data.shape
+    return s.seeded & ~model.good[
+        np.clip(np.rint(s.y).astype(int), 0, ny - 1),
+        np.clip(np.rint(s.x).astype(int), 0, nx - 1)]
 
 
 def _unlike_a_star(flux, quality):
