@@ -120,10 +120,10 @@ class CrowdedMixturePhotometry:
         fitted along with the others for the sake of these. They are not
         reported.
     count_slope : float, optional
-        What is known beforehand of the flux of a found star: numbers of
-        stars fall with it to this negative power. Bright stars do not feel
-        it; of light that could be of either, a faint star takes less. Zero
-        is no knowledge.
+        The prior of the flux of a found star: the number of stars per unit
+        flux falls with this power of the flux. Fluxes of bright stars stay
+        the same; where two stars share light, the fainter one gets less of
+        it. 0 is no prior.
     background_size : float or None, optional
         The distance of the nodes of the bilinear background [pix], or None
         if there is no background to fit.
@@ -271,6 +271,15 @@ class CrowdedMixturePhotometry:
         self.saturation = as_saturation(saturation)
         self.psf_used = psf_model
         self._psf = None if psf_model is None else LocalPSF.of(psf_model)
+
+    def __repr__(self):
+        psf = ('PSF from the image' if self.psf_model is None
+               else repr(self.psf_model))
+        found = ('' if self.results is None
+                 else f', {len(self.results)} stars measured last')
+        return (f'<CrowdedMixturePhotometry({psf}, threshold='
+                f'{self.threshold:g}, background_size='
+                f'{self.background_size}){found}>')
 
     def __call__(self, data, *, mask=None, error=None, init_params=None):
         """

@@ -11,7 +11,11 @@ from astropy.utils.exceptions import AstropyUserWarning
 from photutils_mgauss.motions.bootstrap import bootstrap_frames
 from photutils_mgauss.motions.corrected_epochs import correct_epochs
 from photutils_mgauss.motions.doubts import doubts, remarks
-from photutils_mgauss.motions.loop import Fit, measured_alone
+from photutils_mgauss.motions.loop import (
+    Fit,
+    fitted_terms,
+    measured_alone,
+)
 from photutils_mgauss.motions.propagation import (
     propagated,
     star_covariance,
@@ -24,6 +28,7 @@ from photutils_mgauss.motions.tables import (
     validation_table,
 )
 from photutils_mgauss.sky.observers import julian_years, tdb
+from photutils_mgauss.utils.notebook import with_table
 from photutils_mgauss.utils.validation import as_integer
 
 
@@ -140,6 +145,9 @@ class MotionSolution:
         return (f'<MotionSolution: {solved} of {len(self.stars)} stars, '
                 f'{len(self.epochs)} epochs>')
 
+    def _repr_html_(self):
+        return with_table(repr(self), self.stars)
+
     @cached_property
     def residuals(self):
         """
@@ -150,6 +158,20 @@ class MotionSolution:
         chi-square (of two degrees of freedom, leverage taken into account).
         """
         return residual_table(self._fit)
+
+    @cached_property
+    def terms(self):
+        """
+        The terms that cross-validation confirmed, as a table.
+
+        One row for each function of each epoch, a `~astropy.table.QTable`:
+        what is to be added to x and y of a detection [pix] (of epochs in
+        the sky, in their units) is ``dx``, ``dy`` times powers (``powers``)
+        of magnitude, colour and row. The former are scaled by the middle
+        and half range in ``meta``, within -1.5 and 1.5, the row by ``rows``.
+        No rows where there are no terms.
+        """
+        return fitted_terms(self._fit)
 
     @property
     def sky(self):
@@ -250,39 +272,39 @@ class MotionSolution:
         n = as_integer(n_resamples, 'n_resamples', minimum=1)
         return bootstrap_frames(self._fit, n, rng)
 
-    def plot_residuals(self, ax, epoch):
+    def plot_residuals(self, epoch, *, ax=None):
         """
         Draw the residuals of one epoch as arrows.
 
         Parameters
         ----------
-        ax : `~matplotlib.axes.Axes`
-            Where to draw, and what is returned.
         epoch : int
             Number of the epoch, from 0.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw; None is pyplot's current Axes.
 
         Returns
         -------
         `~matplotlib.axes.Axes`
         """
         from photutils_mgauss.plotting import plot_residual_vectors
-        return plot_residual_vectors(ax, self, epoch)
+        return plot_residual_vectors(self, epoch, ax=ax)
 
-    def plot_motions(self, ax):
+    def plot(self, *, ax=None):
         """
         Plot the proper-motion diagram.
 
         Parameters
         ----------
-        ax : `~matplotlib.axes.Axes`
-            Where to draw, and what is returned.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw; None is pyplot's current Axes.
 
         Returns
         -------
         `~matplotlib.axes.Axes`
         """
         from photutils_mgauss.plotting import plot_proper_motions
-        return plot_proper_motions(ax, self.stars)
+        return plot_proper_motions(self.stars, ax=ax)
 
     @property
     def _year(self):

@@ -291,11 +291,23 @@ def alignment_table(fit, wcs_residuals):
         table[name] = values
     floor = np.broadcast_to(state.floor.T, (2, len(state.maps))).T
     table['systematic'] = np.sqrt(floor) * unit
+    if state.scales is not None:
+        _add_scales(table, fit)
     table['wcs_residual'] = np.array(wcs_residuals) * u.mas
     table.meta.update(kind=transform.kind, degree=transform.degree,
                       xcentre=transform.centre[0],
                       ycentre=transform.centre[1], scale=transform.scale)
     return table
+
+
+def _add_scales(table, fit):
+    """Add what multiplies the errors of epochs, at some magnitudes."""
+    ends = np.nanquantile(fit.setup.magnitudes, [0.02, 0.98])
+    magnitudes = np.tile(np.linspace(*ends, 9), (len(table), 1))
+    table['error_magnitude'] = magnitudes
+    factor, added = fit.state.scales.at(magnitudes)
+    table['error_factor'] = np.sqrt(factor)
+    table['error_floor'] = np.sqrt(added) * table['systematic'].unit
 
 
 def _whole_shift(transform, coefficients, centre, tie):

@@ -13,7 +13,6 @@ minimizes
 stars of a group together.
 """
 import warnings
-from dataclasses import replace
 
 import numpy as np
 from astropy.nddata import NDData
@@ -22,6 +21,11 @@ from photutils.psf import PSFPhotometry
 
 from photutils_mgauss.photometry import engine
 from photutils_mgauss.photometry import table as _table
+from photutils_mgauss.photometry.contexts import (
+    context_columns,
+    fit_with_contexts,
+    keep_contexts,
+)
 from photutils_mgauss.photometry.errors import with_all_errors
 from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
 from photutils_mgauss.photometry.saturated import (
@@ -51,7 +55,10 @@ class MixturePSFPhotometry(PSFPhotometry):
     Parameters
     ----------
     psf_model : GriddedMixturePSF, MultiGaussianPSFModel or MixtureField
-        The PSF. Parameters that are ``fixed`` are not fitted: with ``x_0``
+        The PSF. If it depends on the colour of stars, or their flux, as
+        fields of several ``contexts`` do, each star is fitted with its own
+        one; ``init_params`` has a column of that name then. Parameters that
+        are ``fixed`` are not fitted: with ``x_0``
         and ``y_0`` fixed the photometry is forced. Any other PSF model, a
         model whose shape is free, and a grid with another ``interpolation``
         than 'blend' or ``outside`` than 'clamp' is handed to
@@ -233,16 +240,18 @@ class MixturePSFPhotometry(PSFPhotometry):
         if not self._can_fit:
             return super().__call__(data, mask=pixels.mask, error=error,
                                     init_params=init_params)
+        given = init_params
         data, mask, error, init_params = compat.prepare_inputs(
             self, data, pixels.mask, error, init_params)
         if init_params is None:
             return None
+        keep_contexts(self.psf_model, given, init_params)
         self._check_inputs(init_params)
         self.init_params = init_params
         image = self._make_image(data, mask, error)
-        result, group_size = self._fit(image, init_params)
-        if self._saturated:
-            result = self._with_misfit(result, error is not None)
+        result, group_size = self._fit_contexts(image, init_params)
+        result = with_misfit(result, error is not None
+                             or self.effective_gain is not None)
         correlation = self._correlation(image, result)
         result, psf_part = with_all_errors(
             result, image, self.psf_model,
@@ -264,12 +273,22 @@ class MixturePSFPhotometry(PSFPhotometry):
         self._data_processor.finder = self._saturated.finder(self.finder)
         return pixels
 
-    def _with_misfit(self, result, has_error):
-        chi2 = _table.fit_quality(
-            result, np.count_nonzero(self._free),
-            has_error or self.effective_gain is not None)[2]
-        return replace(result, covariances=with_misfit(
-            result.covariances, result.saturated, chi2))
+    def _fit_contexts(self, image, init_params):
+        """Fit the stars, each with the PSF of its own colour or flux."""
+        if not self.psf_model.contexts:
+            return self._fit(image, init_params)
+        columns, missing = context_columns(self.psf_model, init_params)
+        result, group_size, settled = fit_with_contexts(
+            lambda image: self._fit(image, init_params), image,
+            self.psf_model, columns)
+        if not settled:
+            missing.append(
+                'stars still moved when their PSFs were adapted to colours '
+                'or fluxes for the last time: check stars that are close to '
+                'each other')
+        for sentence in missing:
+            warnings.warn(sentence, AstropyUserWarning, stacklevel=4)
+        return result, group_size
 
     def _correlation(self, image, result):
         """Return the correlation of the noise if it counts."""

@@ -4,11 +4,12 @@ Saturated stars among those of PSF photometry: fitted to their wings.
 Their pixels are left out, the fit starts where the wings say the star is, and
 sees pixels as far out as it takes to have wings all around.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy.table import QTable
 
+from photutils_mgauss.photometry.table import fit_quality
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.psf.wings import stars_behind
 from photutils_mgauss.utils.flags import SATURATED
@@ -139,10 +140,12 @@ def flag(flags, rows):
     return flags
 
 
-def with_misfit(covariances, rows, reduced_chi2):
-    """Return covariances, of saturated stars larger where the PSF is off."""
-    out = covariances.copy()
-    rows = rows[rows >= 0]
-    factor = np.maximum(np.nan_to_num(reduced_chi2[rows], nan=1.0), 1.0)
-    out[rows] *= factor[:, None, None]
-    return out
+def with_misfit(result, has_error):
+    """Return a FitResult with larger errors where wings do not fit."""
+    rows = result.saturated[result.saturated >= 0]
+    if not rows.size:
+        return result
+    chi2 = fit_quality(result, np.count_nonzero(result.free), has_error)[2]
+    covariances = result.covariances.copy()
+    covariances[rows] *= np.fmax(chi2[rows], 1)[:, None, None]
+    return replace(result, covariances=covariances)

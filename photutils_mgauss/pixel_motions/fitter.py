@@ -20,6 +20,7 @@ from photutils_mgauss.pixel_motions.campaign import read_campaign
 from photutils_mgauss.pixel_motions.errors import (
     errors_of,
     frame_covariance,
+    with_psf_errors,
 )
 from photutils_mgauss.pixel_motions.find import BRIGHT, Grid, candidates
 from photutils_mgauss.pixel_motions.solution import PixelMotionSolution
@@ -73,6 +74,10 @@ class PixelMotionFitter:
         What has a flux of its own: each image, each band, or nothing but
         the star. Fluxes in common make faint stars a little more precise;
         they need images of one scale and stars that do not vary.
+    reach : float, optional
+        How far from its given place and motion a faint star may be in each
+        image, in units of the FWHM of the PSF, unless the data are sure that
+        it is farther away. Bright stars are free.
 
     Examples
     --------
@@ -94,7 +99,7 @@ class PixelMotionFitter:
 
     def __init__(self, *, parallax=False, acceleration=False, references=None,
                  fit_shape=11, fit_sky=True, forced=False, executor=None,
-                 progress_bar=False, flux='image'):
+                 progress_bar=False, flux='image', reach=0.75):
         self.parallax = parallax
         self.acceleration = acceleration
         self.references = references
@@ -104,6 +109,7 @@ class PixelMotionFitter:
         self.executor = executor
         self.progress_bar = progress_bar
         self.flux = flux
+        self.reach = reach
         self._check()
 
     def __repr__(self):
@@ -215,13 +221,16 @@ class PixelMotionFitter:
     def _solve(self, campaign, listed):
         """Return the solution of the stars listed."""
         start = campaign.views(listed.values[:, None]).pixels
-        solved = solve(campaign, listed.values,
-                       as_shape(self.fit_shape, 'fit_shape'),
-                       forced=self.forced, executor=self.executor,
+        shape = as_shape(self.fit_shape, 'fit_shape')
+        solved = solve(campaign, listed.values, shape,
+                       reach=self.reach, forced=self.forced,
+                       executor=self.executor,
                        progress_bar=self.progress_bar)
         errors = errors_of(campaign, solved)
         if campaign.estimated:
             errors = _scaled(campaign, solved, errors)
+        errors = with_psf_errors(campaign, solved, errors, shape,
+                                 self.executor)
         if self.references is not None:
             errors = replace(errors, covariance=errors.covariance
                              + frame_covariance(self.references, campaign,
@@ -241,6 +250,7 @@ class PixelMotionFitter:
 
     def _check(self):
         as_choice(self.flux, 'flux', FLUXES)
+        as_real(self.reach, 'reach', above=0)
         as_shape(self.fit_shape, 'fit_shape')
         for name in ('parallax', 'acceleration', 'fit_sky', 'forced',
                      'progress_bar'):

@@ -1,9 +1,10 @@
-"""Figures of epochs and proper motions, on the Axes they are given."""
+"""Figures of epochs and proper motions."""
 import numpy as np
 
-from photutils_mgauss.plotting.style import BLUE, ORANGE
+from photutils_mgauss.plotting.style import BLUE, ORANGE, current_axes
 
 __all__ = [
+    'plot_cutouts',
     'plot_errors_by_epochs',
     'plot_motion_errors',
     'plot_proper_motions',
@@ -11,42 +12,48 @@ __all__ = [
 ]
 
 
-def plot_residual_vectors(ax, solution, epoch, *, scale=None):
+def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     """
     Draw the residuals of one epoch's references and stars as arrows.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     solution : `~photutils_mgauss.MotionSolution`
         Whose residuals.
     epoch : int
         Number of the epoch, from 0.
     scale : float, optional
-        Residual [mas] as long as a tenth of the field; the default is three
-        times the median residual.
+        Residual [mas] as long as a tenth of the field, which the key shows;
+        the default is three times the median residual.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same; rejected detections are orange.
+        Its Axes; rejected detections are orange.
     """
+    ax = current_axes(ax)
     rows = solution.residuals[solution.residuals['epoch'] == epoch]
     x, y = _field_coordinates(rows)
     u, v = rows['dra'].value, rows['ddec'].value
     good = np.isfinite(x + y + u + v)
     if scale is None:
         scale = 3 * np.median(np.hypot(u[good], v[good]))
-    width = np.ptp(x[good]) / 10
+    unit = scale / (np.ptp(x[good]) / 10)
     used = np.asarray(rows['used'])
     for which, colour in ((good & used, BLUE), (good & ~used, ORANGE)):
-        ax.quiver(x[which], y[which], u[which], v[which], color=colour,
-                  angles='xy', scale_units='xy', scale=scale / width)
-    ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal',
-           title=f'epoch {epoch}: a tenth of the field is {scale:.2g} '
-                 f'{rows["dra"].unit}')
+        arrows = ax.quiver(x[which], y[which], u[which], v[which],
+                           color=colour, angles='xy', scale_units='xy',
+                           scale=unit)
+    # The frame holds the tips, too.
+    ax.update_datalim(np.column_stack([x + u / unit, y + v / unit])[good])
+    ax.autoscale_view()
+    ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal')
+    ax.set_title(f'epoch {epoch}', loc='left')
     ax.invert_xaxis()
+    ax.quiverkey(arrows, 0.85, 1.04, scale, f'{scale:.2g} {rows["dra"].unit}',
+                 labelpos='W', color=BLUE)
     return ax
 
 
@@ -64,22 +71,23 @@ def _field_coordinates(rows):
             3600 * (dec - middle))
 
 
-def plot_proper_motions(ax, stars):
+def plot_proper_motions(stars, *, ax=None):
     """
     Plot the proper-motion diagram of a table of stars.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     stars : `~astropy.table.QTable`
         As `~photutils_mgauss.MotionSolution.stars`.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same; reference objects are orange.
+        Its Axes; reference objects are orange.
     """
+    ax = current_axes(ax)
     reference = _is_reference(stars)
     for which, colour, label in ((~reference, BLUE, 'stars'),
                                  (reference, ORANGE, 'references')):
@@ -101,23 +109,26 @@ def _is_reference(stars):
     return np.ma.filled(stars['reference'], '') != ''
 
 
-def plot_motion_errors(ax, stars, magnitude):
+def plot_motion_errors(stars, magnitude, *, ax=None):
     """
     Plot errors of motions against magnitude (as Fig. 12 of Nie et al.).
 
     Parameters
     ----------
-    ax, stars : `~matplotlib.axes.Axes`, `~astropy.table.QTable`
+    stars : `~astropy.table.QTable`
         As for `plot_proper_motions`.
     magnitude : (n,) array_like
         A magnitude for each.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same. Reference objects, whose errors a catalogue gave, are left
+        Its Axes. Reference objects, whose errors a catalogue gave, are left
         out.
     """
+    ax = current_axes(ax)
     free = ~_is_reference(stars)
     for name, colour in (('pmra', ORANGE), ('pmdec', BLUE)):
         ax.plot(np.asarray(magnitude)[free],
@@ -129,23 +140,23 @@ def plot_motion_errors(ax, stars, magnitude):
     return ax
 
 
-def plot_errors_by_epochs(ax, solutions):
+def plot_errors_by_epochs(solutions, *, ax=None):
     """
     Plot the median error of motions against the number of epochs.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     solutions : sequence of `~photutils_mgauss.MotionSolution`
         Fits to different numbers of epochs (as Fig. 11 of Nie et al.).
         Their reference objects do not count.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     counts = [len(solution.epochs) for solution in solutions]
     measured = [solution.stars[~_is_reference(solution.stars)]
                 for solution in solutions]
@@ -157,3 +168,66 @@ def plot_errors_by_epochs(ax, solutions):
     ax.set(xlabel='number of epochs', ylabel=f'median error [{unit}]')
     ax.legend()
     return ax
+
+
+def plot_cutouts(cutouts, *, ax=None):
+    """
+    Draw what each image shows of one star: data, model and residual.
+
+    Parameters
+    ----------
+    cutouts : `~astropy.table.QTable`
+        As `~photutils_mgauss.PixelMotionSolution.cutouts` returns it.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        Its Axes: a column for each image, grey from -2 to 5 times the
+        scatter of the residuals in it. Crosses are where the fit has the
+        star.
+
+    Raises
+    ------
+    ValueError
+        If the table has no rows.
+    """
+    if not len(cutouts):
+        msg = 'cutouts must have at least one row, got none'
+        raise ValueError(msg)
+    ax = current_axes(ax)
+    parts = ('data', 'model', 'residual')
+    stamps = np.stack([_plain(cutouts[name]) for name in parts])
+    _, n, ny, nx = stamps.shape
+    # Images of different depth are shown alike.
+    noise = 1.4826 * np.nanmedian(np.abs(stamps[2]), axis=(1, 2))
+    stamps = stamps / np.where(noise > 0, noise, 1)[:, None, None]
+    picture = np.full((3 * (ny + 1) - 1, n * (nx + 1) - 1), np.nan)
+    for i in range(3):
+        for k in range(n):
+            top, left = (2 - i) * (ny + 1), k * (nx + 1)
+            picture[top:top + ny, left:left + nx] = stamps[i, k]
+    ax.imshow(picture, origin='lower', cmap='gray_r', vmin=-2, vmax=5,
+              interpolation='nearest')
+    _mark_star(ax, cutouts, (ny, nx))
+    ax.set_xticks((nx + 1) * np.arange(n) + (nx - 1) / 2,
+                  [f'{year:.2f}' for year in _plain(cutouts['time'])])
+    ax.set_yticks((ny + 1) * np.arange(3) + (ny - 1) / 2, parts[::-1])
+    ax.tick_params(length=0)
+    ax.set(xlabel='year')
+    return ax
+
+
+def _mark_star(ax, cutouts, shape):
+    """Mark the place of the star in all stamps."""
+    ny, nx = shape
+    x, y = _plain(cutouts['x']), _plain(cutouts['y'])
+    columns = (nx + 1) * np.arange(len(x)) + (nx - 1) // 2 + x - np.rint(x)
+    for i in range(3):
+        ax.plot(columns, (ny + 1) * i + (ny - 1) // 2 + y - np.rint(y), '+',
+                color=ORANGE, markersize=4, markeredgewidth=0.7)
+
+
+def _plain(column):
+    return np.asarray(getattr(column, 'value', column), float)

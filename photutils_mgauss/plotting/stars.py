@@ -1,49 +1,98 @@
-"""Figures of measured stars, on the Axes they are given."""
+"""Figures of measured stars."""
 import numpy as np
 from astropy.stats import mad_std
 
-from photutils_mgauss.plotting.style import BLACK, BLUE, CYCLE, ORANGE
+from photutils_mgauss.plotting.style import (
+    BLACK,
+    BLUE,
+    CYCLE,
+    ORANGE,
+    VERMILION,
+    current_axes,
+)
 
 __all__ = [
     'plot_comparison',
     'plot_detections',
     'plot_error_curve',
+    'plot_residual_image',
     'plot_stated_errors',
 ]
 
 
-def plot_detections(ax, x, y, flux):
+def plot_detections(x, y, flux, *, data=None, ax=None):
     """
     Map the stars of a catalogue, brighter ones larger.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     x, y, flux : (n,) array_like
         Positions [pix] and fluxes.
+    data : (ny, nx) array_like, optional
+        The image, to be shown below circles about the stars.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     flux = np.maximum(np.nan_to_num(flux), 1e-300)
     size = np.clip(np.log10(flux / np.percentile(flux, 5)), 0.1, 3)
-    ax.scatter(x, y, s=4 * size**2, color=BLACK, linewidths=0, alpha=0.7)
+    if data is None:
+        ax.scatter(x, y, s=4 * size**2, color=BLACK, linewidths=0, alpha=0.7)
+    else:
+        _show_image(ax, np.asarray(data, float))
+        ax.scatter(x, y, s=20 + 10 * size**2, facecolors='none',
+                   edgecolors=VERMILION, linewidths=0.6)
     ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal',
            title=f'{len(flux)} stars')
     return ax
 
 
-def plot_stated_errors(ax, magnitude, errors, *, unit, label=None):
+def _show_image(ax, data):
+    """Show an image so that faint and bright stars are seen."""
+    middle, spread = np.nanmedian(data), mad_std(data, ignore_nan=True)
+    shown = np.arcsinh((data - middle) / max(3 * spread, 1e-300))
+    ax.imshow(shown, origin='lower', cmap='gray_r', interpolation='nearest')
+
+
+def plot_residual_image(residual, error, *, limit=5, ax=None):
+    """
+    Show what a model of the stars leaves of an image, in standard errors.
+
+    Parameters
+    ----------
+    residual : (ny, nx) array_like
+        Image minus model and sky; NaN is left out.
+    error : (ny, nx) array_like
+        The standard deviation of the pixels, in the unit of ``residual``.
+    limit : float, optional
+        The number of standard errors at the ends of the colours.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        Its Axes, with a colour bar beside them.
+    """
+    ax = current_axes(ax)
+    shown = ax.imshow(np.asarray(residual) / np.asarray(error),
+                      origin='lower', cmap='RdBu_r', vmin=-limit, vmax=limit,
+                      interpolation='nearest')
+    ax.figure.colorbar(shown, ax=ax, label='residual / error')
+    ax.set(xlabel='x [pix]', ylabel='y [pix]')
+    return ax
+
+
+def plot_stated_errors(magnitude, errors, *, unit, label=None, ax=None):
     """
     Plot the stated errors of stars against their magnitudes.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     magnitude : (n,) array_like
         Magnitudes [mag].
     errors : dict of (n,) array_like
@@ -52,12 +101,14 @@ def plot_stated_errors(ax, magnitude, errors, *, unit, label=None):
         Their unit.
     label : str, optional
         What the magnitudes are.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     for (name, values), colour in zip(errors.items(), CYCLE, strict=False):
         ax.plot(magnitude, values, '.', color=colour, markersize=3,
                 label=name)
@@ -67,14 +118,12 @@ def plot_stated_errors(ax, magnitude, errors, *, unit, label=None):
     return ax
 
 
-def plot_error_curve(ax, magnitude, residuals, errors, *, unit, n_bins=6):
+def plot_error_curve(magnitude, residuals, errors, *, unit, n_bins=6, ax=None):
     """
     Plot errors against magnitude (as Figs. 9-10 of Nie et al.).
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     magnitude : (n,) array_like
         Magnitudes [mag].
     residuals, errors : (n,) or (n, 2) array_like
@@ -83,12 +132,14 @@ def plot_error_curve(ax, magnitude, residuals, errors, *, unit, n_bins=6):
         Their unit, for the label.
     n_bins : int, optional
         The number of magnitude bins.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     magnitude = np.asarray(magnitude, float)
     residuals = np.reshape(residuals, (len(magnitude), -1))
     errors = np.reshape(errors, (len(magnitude), -1))
@@ -108,24 +159,24 @@ def plot_error_curve(ax, magnitude, residuals, errors, *, unit, n_bins=6):
     return ax
 
 
-def plot_comparison(ax, true, measured, errors, *, label, unit):
+def plot_comparison(true, measured, errors, *, label, unit, ax=None):
     """
     Plot measured values against true ones, with error bars.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     true, measured, errors : (n,) array_like
         Values and standard errors.
     label, unit : str
         What they are, for the labels.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     ax.errorbar(true, measured, errors, fmt='.', color=BLUE, ecolor=BLUE,
                 alpha=0.5, elinewidth=0.7)
     limits = np.nanmin(true), np.nanmax(true)

@@ -142,6 +142,30 @@ class StarPixels:
             psf[part], noise[part] = one, other
         return psf, noise
 
+    def shifts(self, executor=None):
+        """
+        Return how the fits of stars answer each change of the PSF.
+
+        Returns
+        -------
+        (n, 3, R) `~numpy.ndarray`
+            Of the flux, as a part of it, and of x and y [pix]; NaN for what
+            is not fitted.
+        """
+        out = np.full((len(self.values), 3, self.psf.changes.shape[1]),
+                      np.nan)
+        templates = self._templates()
+        order = np.argsort(templates[2], kind='stable')
+        size = max(1, _CHUNK // (int(np.prod(self.fit_shape))
+                                 * (3 + out.shape[2])))
+        parts = [order[i:i + size] for i in range(0, order.size, size)]
+        work = partial(self._shifts, *templates)
+        for part, one in zip(parts, map_parallel(
+                work, parts, executor=executor, long=len(parts) > 1),
+                strict=True):
+            out[np.ix_(part, self.free)] = one[0]
+        return out
+
     def _templates(self):
         """Return node, phases and the number of both for each star."""
         _, x, y = self.values.T
@@ -152,23 +176,26 @@ class StarPixels:
         key = (node * _PHASES + steps[0]) * _PHASES + steps[1]
         return node, phase, key
 
-    def _part(self, node, phase, key, matrix, rows):
+    def _shifts(self, node, phase, key, rows):
+        """Return shifts, covariances, derivatives and weights of stars."""
         _, first, which = np.unique(key[rows], return_index=True,
                                     return_inverse=True)
         some = rows[first]
         images = self.psf.images(
             node[some], phase[0][some], phase[1][some], self.fit_shape,
             integrated=self.integrated)[which]
-        flux = self.values[rows, 0]
-        weight = self._weights(rows, np.maximum(flux[:, None] * images[:, 0],
-                                                0))
+        weight = self._weights(rows, np.maximum(
+            self.values[rows, :1] * images[:, 0], 0))
         design = images[:, self.free]
         if self.fit_sky:
             design = np.concatenate([design, np.ones_like(design[:, :1])], 1)
         # Fluxes in units of the flux: x and y then answer in pixels.
         shifts, inverse = responses(design, weight, images[:, 3:])
-        n_free = self.free.size
-        shifts = shifts[:, :n_free]
+        return shifts[:, :self.free.size], inverse, design, weight
+
+    def _part(self, node, phase, key, matrix, rows):
+        shifts, inverse, design, weight = self._shifts(node, phase, key, rows)
+        flux, n_free = self.values[rows, 0], self.free.size
         psf = shifts @ shifts.transpose(0, 2, 1)
         units = np.where(self.free == 0, flux[:, None], 1.0)
         psf *= units[:, :, None] * units[:, None]

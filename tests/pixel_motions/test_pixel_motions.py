@@ -20,11 +20,15 @@ from helpers.moving_stars import (
 from helpers.star_images import MIXTURE
 from photutils_mgauss import (
     Epoch,
+    GaussianMixture,
+    GriddedMixturePSF,
+    MultiGaussianPSFModel,
     PixelMotionFitter,
     ProperMotionFitter,
     decode_motion_flags,
     fit_many,
 )
+from photutils_mgauss.psf.errors import PSFErrors
 
 YEARS = (2024.9, 2026.4, 2026.6, 2028.5)
 NAMES = ('ra', 'dec', 'pmra', 'pmdec')
@@ -146,7 +150,7 @@ def test_stars_at_rest_in_one_image_are_those_of_fit_many(rng):
     for name in ('ra', 'dec'):
         assert_allclose(table[name].value, want[name].value, rtol=0,
                         atol=1e-5 * SCALE / 3.6e6)
-    assert_allclose(table['ra_error'].value, want['ra_err'].value, rtol=3e-3)
+    assert_allclose(table['ra_error'].value, want['ra_error'].value, rtol=3e-3)
     assert np.isnan(table['pmra'].value).all()
     assert any('position_only' in sentence for sentence in
                decode_motion_flags(table['flags'][0]))
@@ -174,6 +178,67 @@ def test_faint_stars_have_errors_that_are_true(rng):
         / errors(table))[good, :4]
     assert abs(pull.std() - 1) < 4 / np.sqrt(2 * pull.size)
     assert abs(np.mean(table['flux'][good]) / flux - 1) < 0.03
+
+
+def literal_chances(image, place, axis, flux):
+    """Return exp(-chi2 / 2) at offsets (y, x) from a place, and fluxes."""
+    x, y = place
+    i, j = round(y), round(x)
+    data = image.data[i - 5:i + 6, j - 5:j + 6]
+    out = np.empty((axis.size, axis.size, flux.size))
+    for a, dy in enumerate(axis):
+        for b, dx in enumerate(axis):
+            psf = MIXTURE.render((11, 11), x + dx - j + 5, y + dy - i + 5)
+            left = data - flux[:, None, None] * psf
+            left -= left.mean(axis=(1, 2), keepdims=True)
+            out[a, b] = -0.5 * np.sum(left**2, axis=(1, 2)) / image.error**2
+    return np.exp(out - out.max())
+
+
+def literal_mean(images, place, reach):
+    """Return mean and scatter of a place, of all fluxes from 0 on."""
+    axis = np.arange(-reach, reach + 0.01, 0.1)
+    flux = np.arange(-80.0, 260, 2.0)
+    each = [literal_chances(image, place, axis, flux) for image in images]
+    typical = np.mean([flux[np.unravel_index(one.argmax(), one.shape)[2]]
+                       for one in each])
+    chance = 0
+    for part in (0, 0.1, 0.3, 1.0):
+        width = max(part * typical, 0.5)
+        # The mean flux down, that of an image across.
+        scatter = np.exp(-0.5 * ((flux[:, None] - flux) / width)**2) / width
+        both = np.prod([one @ scatter for one in each], axis=0)
+        chance = chance + both[..., flux >= 0].sum(axis=2)
+    dy, dx = np.meshgrid(axis, axis, indexing='ij')
+    chance[np.hypot(dx, dy) >= reach] = 0
+    chance /= chance.sum()
+    mean = np.array([np.sum(chance * d) for d in (dx, dy)])
+    return mean, np.sqrt([np.sum(chance * (d - m)**2)
+                          for d, m in zip((dx, dy), mean, strict=True)])
+
+
+def test_a_faint_star_is_the_mean_of_its_probability(rng):
+    star = truth(30.2, 29.6)
+    images = observe(star, 50.0, [2026.0, 2026.0], rng,
+                     frames=[make_wcs(), make_wcs()])
+    mean, error = literal_mean(images, (30.2, 29.6), 1.5)
+    with pytest.warns(AstropyUserWarning, match='at one time'):
+        table = PixelMotionFitter(reach=1.5 / 2.56329).fit(
+            images, star['ra', 'dec']).stars
+    got = np.array(make_wcs().world_to_pixel(SkyCoord(
+        table['ra'], table['dec'])))[:, 0] - (30.2, 29.6)
+    assert_allclose(got, mean, rtol=0, atol=0.1 * error.min())
+    stated = np.array([table[f'{name}_error'][0].value
+                       for name in ('ra', 'dec')]) / SCALE
+    assert_allclose(stated, error, rtol=0.1)
+
+
+def test_a_star_that_is_surely_beyond_reach_is_where_it_is(rng):
+    star, beside = truth(30.2, 29.6), truth(33.0, 29.6)
+    images = observe(star, 120.0, YEARS, rng)
+    table = PixelMotionFitter().fit(images, beside['ra', 'dec']).stars
+    pull = offsets(table, star) / errors(table)
+    assert np.abs(pull[0, :4]).max() < 4
 
 
 def test_forced_fluxes_are_light_curves_at_places_given(rng):
@@ -239,6 +304,64 @@ def test_errors_of_frames_are_those_of_frames_that_move(rng):
         expected += 100 * change[4, :4]**2
     # Positions of all frames together are free: nothing is added there.
     assert_allclose(added[4], expected, rtol=0.05, atol=2e-3)
+
+
+def unsure_psf(change):
+    """Return the PSF, and one that is off by its one change."""
+    grid = GriddedMixturePSF([MIXTURE], [(0, 0)]).grid
+    known = PSFErrors(grid, change[None, None])
+    psf = GriddedMixturePSF._of_grid(grid, errors=known)
+    off = GaussianMixture(
+        MIXTURE.weights + change[:, 0], MIXTURE.means + change[:, 1:3],
+        MIXTURE.covariances + change[:, [3, 4, 4, 5]].reshape(-1, 2, 2))
+    return psf, MultiGaussianPSFModel(off)
+
+
+@pytest.mark.parametrize('same', [False, True])
+def test_errors_of_psfs_are_those_of_psfs_that_change(rng, same):
+    change = 1e-3 * np.array([[2, 8, -5, 3, 1, -2],
+                              [-2, 20, 10, -20, 5, 10.0]])
+    star = truth(30.2, 29.6)
+    images = observe(star, 5000.0, YEARS, rng)
+    one, off = unsure_psf(change)
+    unsure = [replace(image, psf=one if same else unsure_psf(change)[0])
+              for image in images]
+    start = star['id', 'ra', 'dec']
+    known, free = (PixelMotionFitter().fit(some, start).stars
+                   for some in (images, unsure))
+    expected, flux = np.zeros(4), np.zeros(len(images))
+    for changed in ([range(len(images))] if same else
+                    [[k] for k in range(len(images))]):
+        wrong = [replace(image, psf=off) if k in changed else image
+                 for k, image in enumerate(images)]
+        table = PixelMotionFitter().fit(wrong, start).stars
+        expected += (offsets(table, star) - offsets(known, star))[0, :4]**2
+        flux[changed] = (table['flux'] - known['flux'])[0, changed]
+    added = (errors(free)**2 - errors(known)**2)[0, :4]
+    assert_allclose(added, expected, rtol=0.1, atol=0.02 * expected.max())
+    more = free['flux_err'][0]**2 - known['flux_err'][0]**2
+    assert_allclose(more, flux**2, rtol=0.1)
+
+
+def test_cutouts_are_the_pixels_around_a_star(rng):
+    stars = truth([30.2, 12.0], [29.6, 57.8])
+    images = observe(stars, [3000.0, 400.0], YEARS, rng)
+    solution = PixelMotionFitter().fit(images, stars['id', 'ra', 'dec'])
+    table = solution.cutouts(0, size=(7, 9))
+    x, y = np.rint([table['x'].value, table['y'].value]).astype(int)
+    sky = solution.fluxes['local_bkg'][:len(images)]
+    for k, image in enumerate(images):
+        box = slice(y[k] - 3, y[k] + 4), slice(x[k] - 4, x[k] + 5)
+        assert_allclose(table['data'][k], image.data[box] - sky[k])
+        assert_allclose(table['model'][k], solution.model(k)[box],
+                        atol=0.02)
+    assert_allclose(table['residual'], table['data'] - table['model'])
+    assert abs(table['residual'].std() - 3) < 0.4
+    faint = solution.cutouts()
+    assert faint.meta['ID'] == 1
+    assert np.isnan(faint['data']).any()
+    with pytest.raises(ValueError, match='star must be'):
+        solution.cutouts(7)
 
 
 # What goes wrong.
@@ -320,6 +443,7 @@ def test_images_of_other_units_are_converted(rng):
 @pytest.mark.parametrize(('options', 'error', 'word'), [
     ({'flux': 'each'}, ValueError, 'flux must be'),
     ({'fit_shape': 0}, ValueError, 'fit_shape'),
+    ({'reach': 0}, ValueError, 'reach'),
     ({'forced': 1}, TypeError, 'forced'),
     ({'references': [1]}, TypeError, 'references'),
     ({'executor': 3}, TypeError, 'executor')])
