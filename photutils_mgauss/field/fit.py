@@ -37,6 +37,7 @@ from photutils_mgauss.field.input import (
     read_exposures,
     read_sample,
 )
+from photutils_mgauss.field.misfit import misfit
 from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.field.normal import Workers, model_stamps
 from photutils_mgauss.field.pixel import chosen_pixel, warn_of_phase
@@ -338,8 +339,11 @@ def _free(problem, n_components, degree, top, workers, strength, reject):
         strength, workers)
     problem.basis = np.ascontiguousarray(
         problem.basis[:, :stages.n_terms(degree)])
-    return stages.run(problem, n_components, degree, workers,
-                      strength=strength, reject=reject), choice
+    fit = stages.run(problem, n_components, degree, workers,
+                     strength=strength, reject=reject)
+    if problem.pixel_integrated:
+        stages.allow_for_misfit(fit, misfit(fit), workers)
+    return fit, choice
 
 
 def _number(value, name, minimum):

@@ -468,7 +468,8 @@ class MixtureField(Field):
             lambda x, y, change: (self._basis(x, y, kind), *self._mixtures(
                 x, y, kind, change)[:3]),
             self.covariance, self._unmodelled(), self.degree, self.shape,
-            self.pixel_integrated, self._blur_variance(exposure))
+            self.pixel_integrated, self._blur_variance(exposure),
+            self.accuracy if self.pixel_integrated else 0.0)
 
     def _blur_variance(self, exposure):
         """Return the variances (3,) of what an exposure adds, if any."""
