@@ -227,7 +227,7 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
             problem, pixel_integrated, regularization or 1.0, workers)
         fit, choice = _free(problem, n_components, degree, top, workers,
                             regularization, reject)
-        fatter = _fatter(fit, brighter_fatter, workers, reject)
+        fit, fatter = _fatter(fit, brighter_fatter, workers, reject)
     field = _result(fit, sample, radius, choice, centre, fatter)
     if normalise == 'stamps':
         return field
@@ -275,28 +275,35 @@ def _read(data, stars, error, mask, radius, gain, contexts):
 
 
 def _fatter(fit, wanted, workers, reject):
-    """Return how fluxes widen stars, of which the fit then knows."""
+    """Return the fit, and how fluxes widen stars if it knows of that."""
     if wanted is False:
-        return None
+        return fit, None
     found = measure_fattening(fit, workers)
     if wanted is True and found is None:
         msg = ('brighter_fatter must be False for so few stars, or stars of '
                'one flux')
         raise ValueError(msg)
     if found is None or not (wanted is True or found.is_real):
-        return None
+        return fit, None
+    # Nothing of it is shared.
+    before = replace(fit, problem=fit.problem.subset(
+        np.arange(len(fit.problem.basis))))
     for _ in range(_FATTER_STEPS):
         fit.fattening = found.value
         stages.polish(fit, workers, reject)
-        found = measure_fattening(fit, workers)
+        # Stars that were dropped meanwhile may be too many to measure again.
+        found = measure_fattening(fit, workers) or found
     if wanted == 'auto':
+        if not found.is_real:
+            # Once more stars count, or others, it may be gone.
+            return before, None
         warnings.warn(
             'bright stars are wider than faint ones: the brightest by '
             f'{found.largest * (found.value[0] + found.value[2]) / 2:.4f} '
             f'pix^2 (chi^2 {found.significance:.0f} for 3 numbers); the PSF '
             'is that of faint stars, and brighter_fatter of the field says '
             'how others differ', AstropyUserWarning, stacklevel=4)
-    return found
+    return fit, found
 
 
 def _with_wings(field, sample, exposures, normalise):

@@ -186,7 +186,7 @@ def test_two_halves_of_a_real_image_have_one_centre(realdata):
         some['selected'] &= half
         field = fit_mixture_field(data, some, error=error, mask=mask,
                                   n_components=3, degree=0, radius=5,
-                                  local_bkg=True)
+                                  local_bkg=True, brighter_fatter=False)
         table = MixturePSFPhotometry(field, 5, correlated_noise=False)(
             data, error=error, mask=mask, init_params=bright)
         found.append(np.column_stack([table['x_fit'], table['y_fit']]))
