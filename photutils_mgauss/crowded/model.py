@@ -100,7 +100,7 @@ class Model:
         """Choose stamps and wings, list neighbours, and draw everything."""
         everyone = np.arange(len(self.stars))
         self.wing, self.stamps = self._frames(everyone, 0)
-        self.neighbours = Neighbours.of(self.stars.x, self.stars.y)
+        self._connect()
         self._localise_psf()
         self._draw_stamps(everyone)
         self.residual = self.data - self.background()
@@ -155,6 +155,9 @@ class Model:
 
     def _reconnect(self):
         self._weigh()
+        self._connect()
+
+    def _connect(self):
         self.neighbours = Neighbours.of(self.stars.x, self.stars.y)
 
     def take(self, step, level_step):

@@ -291,7 +291,7 @@ class CrowdedMixturePhotometry:
         given = (None if init_params is None
                  else self._listed(init_params, image.unit))
         psf = self._psf_of(image)
-        options = self._options(image)
+        options = self.options_of(image)
         plan = Plan(image, psf, options, self.tile_shape, self.overlap,
                     given, self._checkpoint)
         outcomes, errors = run(plan, self.executor, self.progress_bar)
@@ -307,15 +307,87 @@ class CrowdedMixturePhotometry:
             raise UnfinishedTilesError(unfinished, table) from errors[0]
         return table
 
+    def fit_images(self, images, stars=None):
+        """
+        Find and fit the stars of one field in many images together.
+
+        The images may be shifted, rotated, of other filters, depths and PSFs.
+        There is one list of stars, found in the evidence of all images, with
+        places in common and a flux for each image, whether or not the star
+        is significant there.
+
+        Parameters
+        ----------
+        images : sequence of (data, psf, wcs) or `ImageEpoch`
+            As for `fit_many`, with the sky left in. Where ``psf`` is None it
+            is ``psf_model`` or, without one, made of the image's own stars.
+        stars : `~astropy.table.Table` or SkyCoord, optional
+            The stars to report, with ``ra`` and ``dec`` [deg]. None is added,
+            none left out, and the result has their order.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            ``id``, ``ra``, ``dec`` [deg], ``ra_err``, ``dec_err`` [mas] and
+            ``radec_cov`` [mas^2]; for each of E images ``x_fit``, ``y_fit``
+            [pix], ``flux``, ``flux_err``, ``local_bkg``, ``n_pixels_fit``,
+            ``image_chi2`` and ``crowding``, (n, E), NaN where an image does
+            not show the star; ``n_images`` that do, and for all of them
+            ``significance``, ``reduced_chi2``, ``flags`` and what is said of
+            neighbours.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not valid.
+        UnfinishedTilesError
+            If a worker failed; the finished tiles are in the error.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from astropy.nddata import NDData, StdDevUncertainty
+        >>> from astropy.wcs import WCS
+        >>> from photutils_mgauss import (CrowdedMixturePhotometry,
+        ...                               GaussianMixture, GriddedMixturePSF)
+        >>> wcs = WCS(naxis=2)
+        >>> wcs.wcs.ctype = 'RA---TAN', 'DEC--TAN'
+        >>> wcs.wcs.cdelt = -1e-5, 1e-5
+        >>> mixture = GaussianMixture([1], [[0, 0]], [[[0.7, 0], [0, 0.8]]])
+        >>> psf = GriddedMixturePSF([mixture], [(0, 0)])
+        >>> rng = np.random.default_rng(1)
+        >>> images = []
+        >>> for flux in (250, 500):
+        ...     data = 20 + mixture.render((40, 40), 15.2, 17, flux=flux)
+        ...     error = np.sqrt(data)
+        ...     noisy = data + error * rng.normal(size=data.shape)
+        ...     images.append((NDData(noisy, StdDevUncertainty(error)), psf,
+        ...                    wcs))
+        >>> table = CrowdedMixturePhotometry(None).fit_images(images)
+        >>> len(table), table['flux'].shape
+        (1, (1, 2))
+        """
+        from photutils_mgauss.crowded.many_images import fit_images
+        table, unfinished, errors = fit_images(self, images, stars)
+        if unfinished:
+            raise UnfinishedTilesError(unfinished, table) from errors[0]
+        return table
+
     def _psf_of(self, image):
         """Return the PSF of an image, made of its stars if none is known."""
         if self._psf is not None:
             return self._psf
+        return LocalPSF.of(self.model_of(image))
+
+    def model_of(self, image):
+        """Return the PSF model, made of an image's stars if none is known."""
+        if self.psf_model is not None:
+            return self.psf_model
         from photutils_mgauss.crowded.psf_loop import LoopOptions
         field, model = self.fit_field(image, LoopOptions(
             progress_bar=self.progress_bar))
         keep(self, field=field, psf_used=model)
-        return LocalPSF.of(model)
+        return model
 
     def fit_field(self, image, options):
         """
@@ -344,13 +416,15 @@ class CrowdedMixturePhotometry:
 
     def _listed(self, init_params, unit):
         x, y, flux, number = _given(init_params, unit)
-        return Stars(x, y, flux, number=number, bound=self._bound)
+        return Stars(x, y, flux, number=number, bound=self.bound)
 
     @property
-    def _bound(self):
+    def bound(self):
+        """How far a listed star may be from its place [pix]."""
         return np.inf if self.xy_bounds is None else self.xy_bounds
 
-    def _options(self, image):
+    def options_of(self, image):
+        """Return the `TileOptions` of a `PixelData` with errors."""
         _, variance = image.sample()
         gain = self.effective_gain
         if gain is None:
@@ -364,7 +438,7 @@ class CrowdedMixturePhotometry:
             floor=float(variance.min()),
             noise=float(np.sqrt(np.median(variance))),
             max_rounds=self.maxiters, find_neighbors=self.find_neighbors,
-            xy_bounds=self._bound,
+            xy_bounds=self.bound,
             depth=self.depth, count_slope=self.count_slope)
 
     def _table(self, outcomes, given, unit):

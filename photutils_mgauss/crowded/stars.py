@@ -129,9 +129,13 @@ class Neighbours:
     distance: np.ndarray
 
     @classmethod
-    def of(cls, x, y):
-        """List the pairs of stars that are solved for together."""
-        owner, neighbour, gap = _close_pairs(x, y)
+    def of(cls, x, y, scale=1.0):
+        """
+        List the pairs of stars that are solved for together.
+
+        ``scale`` is the size of a pixel in units of x and y.
+        """
+        owner, neighbour, gap = _close_pairs(x, y, scale * _PAIR_DISTANCE)
         count = np.bincount(owner, minlength=x.size)
         indptr = np.concatenate([[0], np.cumsum(count)])
         # Ordered by neighbour, then owner, the pairs are their twins.
@@ -149,7 +153,7 @@ class Neighbours:
         return kernels.Pairs(self.indptr, self.neighbour, self.twin)
 
 
-def _close_pairs(x, y):
+def _close_pairs(x, y, reach):
     """
     Return pairs of points within reach of each other, and their distances.
 
@@ -158,7 +162,7 @@ def _close_pairs(x, y):
     if x.size < 2:
         return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
     pairs = cKDTree(np.column_stack([x, y])).query_pairs(
-        _PAIR_DISTANCE, output_type='ndarray')
+        reach, output_type='ndarray')
     owner, neighbour = np.concatenate([pairs, pairs[:, ::-1]]).T
     gap = np.hypot(x[owner] - x[neighbour], y[owner] - y[neighbour])
     order = np.lexsort([neighbour, gap, owner])

@@ -13,6 +13,8 @@ each image are fitted to all their pixels together. With the Jacobian
 so nothing is lost that averaging catalogues would lose, and an image too
 shallow to show the star by itself helps, too.
 """
+from dataclasses import dataclass
+
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
@@ -33,7 +35,12 @@ from photutils_mgauss.photometry.joint_pixels import (
     covariances,
 )
 from photutils_mgauss.sky.observers import add_aberration
-from photutils_mgauss.sky.tangent_plane import TangentPlane, directions
+from photutils_mgauss.sky.pixel_grid import PixelGrid
+from photutils_mgauss.sky.tangent_plane import (
+    TangentPlane,
+    directions,
+    unit_vectors,
+)
 from photutils_mgauss.sky.wcs import (
     check_celestial,
     invert_wcs,
@@ -427,6 +434,82 @@ def _table(state, converged, plane, scale, unit, weighted):
     table['reduced_chi2'] = scatter if weighted else np.nan
     table['converged'] = converged
     return table
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """
+    Many images of one field, read.
+
+    ``pixels`` are `PixelData` with errors, ``psfs`` models of fixed shape or
+    None, ``grid`` is the `~photutils_mgauss.sky.pixel_grid.PixelGrid` that
+    all have in common.
+    """
+
+    pixels: list
+    psfs: list
+    unit: object
+    grid: PixelGrid
+
+
+def read_field(images):
+    """
+    Read images of one field, (data, psf, wcs) or ImageEpoch.
+
+    Returns
+    -------
+    Field
+
+    Raises
+    ------
+    TypeError, ValueError
+        If something is wrong with them.
+    """
+    images = list(images)
+    if not images:
+        msg = 'images must have at least one element, got none'
+        raise ValueError(msg)
+    pixels, psfs, frames = zip(*map(_read_any, images), strict=True)
+    units = [one.unit for one in pixels]
+    if any(unit != units[0] for unit in units):
+        msg = f'images must have one unit, got {units}'
+        raise ValueError(msg)
+    grid = PixelGrid.of(frames, [one.shape for one in pixels])
+    return Field([one.with_error() for one in pixels], list(psfs), units[0],
+                 grid)
+
+
+def _read_any(entry):
+    """Return pixels, PSF or None, and WCS of one image of a field."""
+    if hasattr(entry, 'pixels') and hasattr(entry, 'wcs'):
+        return entry.pixels, entry.model, entry.wcs
+    if not isinstance(entry, (tuple, list)) or len(entry) != 3:
+        msg = ('images must hold (data, psf, wcs) or ImageEpoch, got '
+               f'{entry!r:.80}')
+        raise TypeError(msg)
+    data, psf, wcs = entry
+    check_celestial(wcs)
+    return (read_pixels(data, name='data of images'),
+            None if psf is None else fixed_psf(psf), wcs)
+
+
+def grid_positions(stars, grid):
+    """Return columns and rows (2, n) of a table with ra, dec or SkyCoord."""
+    if isinstance(stars, SkyCoord):
+        place = stars.reshape(-1).icrs
+        ra, dec = place.ra.deg, place.dec.deg
+    else:
+        check_table(stars, 'stars', ('dec', 'ra'))
+        ra, dec = (column_values(stars, name, u.deg)
+                   for name in ('ra', 'dec'))
+    return grid.positions(unit_vectors(ra, dec))
+
+
+def add_places(table, grid, columns, rows, covariance):
+    """Add positions on a grid (n,), of some covariance (n, 2, 2) [pix^2]."""
+    vectors = grid.vectors(columns, rows)
+    _add_columns(table, vectors, grid.plane,
+                 grid.matrix @ covariance @ grid.matrix.T)
 
 
 def _read_image(entry):

@@ -1,0 +1,241 @@
+r"""
+The joint normal equations of the stars and skies of many images.
+
+The unknowns are the fluxes and skies of each image and the places that all
+have in common. In the equations of one image (`Equations`), whose derivatives
+are by the common coordinates, only the blocks of places are shared: for all
+images these add up. They are solved by conjugate gradients; each star's own
+block, with as many fluxes as there are images, is the preconditioner.
+"""
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from photutils_mgauss import kernels
+from photutils_mgauss.crowded.equations import (
+    CG_STEPS,
+    MAX_MOVE,
+    MOST_CHANGE,
+    STRONGEST_PULL,
+    TOLERANCE,
+    Equations,
+)
+
+# Fluxes fall by no more than this fraction at a time.
+_LARGEST_FALL = 0.8
+# Stars whose covariances are made at a time.
+_AT_ONCE = 4096
+
+
+@dataclass(frozen=True)
+class ManyEquations:
+    """
+    The normal equations of all images as they were when they were formed.
+
+    ``each`` are those of single images; ``pull`` (E, n) is what is known of
+    fluxes before, ``hold`` (n,) the inverse variance with which places are
+    held to where they were, ``drift`` (n, 2) away; ``scales`` (E, 1).
+    """
+
+    each: list
+    neighbours: object
+    hold: np.ndarray
+    drift: np.ndarray
+    pull: np.ndarray
+    scales: np.ndarray
+
+    @classmethod
+    def of(cls, tile):
+        """Form the equations of a `ManyTile`."""
+        each = [Equations.of(model) for model in tile.models]
+        stars = tile.stars
+        bare = cls(each, tile.neighbours, stars.hold, stars.drift.T, None,
+                   tile.scales)
+        return cls(*list(vars(bare).values())[:4],
+                   bare._expect(tile.fluxes, tile.options.count_slope),
+                   tile.scales)
+
+    def _own(self):
+        """Return the information on each flux alone (E, n)."""
+        return np.array([np.maximum(one.stars.matrix[:, 0, 0], 0)
+                         for one in self.each])
+
+    def flux_errors(self):
+        """Return standard errors (E, n) of fluxes, nothing else free."""
+        own = self._own()
+        return np.divide(1, np.sqrt(own), where=own > 0,
+                         out=np.zeros(own.shape))
+
+    def summed(self, fluxes, information=None):
+        """
+        Return what fluxes (E, n) say of one flux, and how well (n,).
+
+        The quotient is the flux in an image of scale 1, the first over the
+        root of the second its signal-to-noise ratio.
+        """
+        if information is None:
+            information = self._own()
+        return ((self.scales * information * fluxes).sum(axis=0),
+                (self.scales**2 * information).sum(axis=0))
+
+    def _expect(self, fluxes, slope):
+        """Return the pulls (E, n) of a prior that falls with the flux."""
+        own = self._own()
+        light, known = self.summed(fluxes)
+        pull = np.minimum(
+            slope * np.divide(known, np.maximum(light, 1e-300),
+                              where=known > 0, out=np.zeros(known.size)),
+            STRONGEST_PULL * np.sqrt(known))
+        share = np.divide(self.scales * own, known, where=known > 0,
+                          out=np.zeros(own.shape))
+        return np.where(self.hold > 0, 0, pull) * share
+
+    def solve(self, damping):
+        """Return steps of fluxes (E, n), places (n, 2) and levels."""
+        system = _System.of(self, damping)
+        light, place, levels = system.parts(system.solve())
+        return light, place, levels
+
+    def limited(self, light, place, tile):
+        """Return steps no longer than stars may go at once."""
+        flux = np.maximum(tile.fluxes, 0)
+        error = self.flux_errors()
+        light = np.clip(light, -np.maximum(_LARGEST_FALL * flux, error),
+                        np.maximum((MOST_CHANGE - 1) * flux, error))
+        move = np.clip(place, -MAX_MOVE, MAX_MOVE)
+        bound = tile.stars.bound[:, None]
+        return light, np.where(np.isfinite(bound), np.clip(
+            move, -bound - self.drift, bound - self.drift), move)
+
+    def covariances(self):
+        """
+        Return what is known of the stars with their neighbours free.
+
+        Returns
+        -------
+        (n, 2, 2), (E, n), (E, n) `~numpy.ndarray`
+            The covariances of places, the variances of fluxes, and their
+            correlations with that of the nearest neighbour.
+        """
+        n, n_images = len(self.hold), len(self.each)
+        place = np.empty((n, 2, 2))
+        variance, correlation = np.empty((2, n_images, n))
+        for first in range(0, n, _AT_ONCE):
+            part = slice(first, min(first + _AT_ONCE, n))
+            together = self._together(part)
+            place[part] = together.free[:, :2, :2]
+            for k, one in enumerate(self.each):
+                kernels.flux_variances(
+                    first, one.stars, self.neighbours.pairs, together,
+                    variance[k, part], correlation[k, part])
+        return place, variance, correlation
+
+    def _together(self, part):
+        """Return stars with neighbours, and what is known of their places."""
+        n, m = part.stop - part.start, kernels.MOST_TOGETHER
+        together = kernels.Together(
+            np.zeros((n, m), np.int64), np.zeros(n, np.int64),
+            np.zeros((n, 2 * m, 2 * m)))
+        for one in self.each:
+            kernels.add_places(part.start, one.stars, self.neighbours.pairs,
+                               together)
+        if self.hold.any():
+            held = self.hold[together.members]
+            at = np.arange(2 * m)
+            together.free[:, at, at] += np.repeat(held, 2, axis=1)
+        kernels.invert_places(together)
+        return together
+
+
+@dataclass(frozen=True)
+class _System:
+    """Equations of one flat vector: fluxes, places, levels of each image."""
+
+    stars: list
+    meshes: list
+    pairs: object
+    hold: np.ndarray
+    right: np.ndarray
+    blocks: kernels.Blocks
+
+    @classmethod
+    def of(cls, equations, damping):
+        each = equations.each
+        stars = [one.stars._replace(
+            matrix=one.stars.matrix * (1 + damping * np.eye(3)))
+            for one in each]
+        meshes = [one.mesh._replace(
+            diagonal=one.mesh.diagonal * (1 + one.level_damping))
+            for one in each]
+        hold = equations.hold[:, None]
+        place = sum(one.stars.gradient[:, 1:] for one in each)
+        right = [*(one.stars.gradient[:, 0] - pull for one, pull in zip(
+            each, equations.pull, strict=True)),
+            (place - hold * equations.drift).ravel(),
+            *(one.mesh.gradient for one in each)]
+        return cls(stars, meshes, equations.neighbours.pairs, hold,
+                   np.concatenate(right), _blocks(stars, meshes, hold))
+
+    @property
+    def _ends(self):
+        """Where places end and the levels of each image."""
+        n, n_images = len(self.hold), len(self.stars)
+        sizes = [mesh.gradient.size for mesh in self.meshes]
+        return np.cumsum([(n_images + 2) * n, *sizes])
+
+    def parts(self, v):
+        """Return the parts of a vector: fluxes, places, levels."""
+        n, n_images, ends = len(self.hold), len(self.stars), self._ends
+        return (v[:n * n_images].reshape(n_images, n),
+                v[n * n_images:ends[0]].reshape(n, 2),
+                [v[a:b] for a, b in pairwise(ends)])
+
+    def _apply(self, v, scratch, out):
+        """Put the product with a vector into out."""
+        n_images = len(self.stars)
+        out[:] = 0
+        _, place, _ = self.parts(v)
+        self.parts(out)[1][:] = self.hold * place
+        for k, first in enumerate(self._ends[:-1]):
+            kernels.apply_shared(k, n_images, first, v, self.stars[k],
+                                 self.pairs, self.meshes[k], scratch, out)
+
+    def solve(self):
+        """Return the solution by preconditioned conjugate gradients."""
+        r = self.right.copy()
+        step, z, a = np.zeros((3, r.size))
+        largest = max(mesh.gradient.size for mesh in self.meshes)
+        scratch = np.empty((2, 3 * len(self.hold) + largest))
+        rz = kernels.precondition_shared(self.blocks, r, z)
+        v, goal = z.copy(), TOLERANCE**2 * rz
+        for _ in range(CG_STEPS):
+            if not rz > goal:
+                break
+            self._apply(v, scratch, a)
+            kernels.advance(rz, v, a, step, r)
+            before = rz
+            rz = kernels.precondition_shared(self.blocks, r, z)
+            v *= rz / before
+            v += z
+        return step
+
+
+def _blocks(stars, meshes, hold):
+    """Return what the inverse of each star's own block is made of."""
+    diagonal = np.array([one.matrix[:, 0, 0] for one in stars])
+    own = np.divide(1, diagonal, where=diagonal > 0,
+                    out=np.zeros(diagonal.shape))
+    share = np.array([one.matrix[:, 0, 1:] for one in stars])
+    left = hold[:, :, None] * np.eye(2)
+    for one, inverse, cross in zip(stars, own, share, strict=True):
+        left = left + one.matrix[:, 1:, 1:] - (
+            inverse[:, None, None] * cross[:, :, None] * cross[:, None, :])
+    a, b, d = left[:, 0, 0], left[:, 0, 1], left[:, 1, 1]
+    det = a * d - b * b
+    # Of stars that are nowhere seen nothing moves.
+    good = (a > 0) & (d > 0) & (det > 1e-12 * a * d)
+    inverse = np.array([[d, -b], [-b, a]]) / np.where(good, det, 1)
+    return kernels.Blocks(
+        own, share, np.where(good, inverse, 0).transpose(2, 0, 1).copy(),
+        1 / np.concatenate([mesh.diagonal for mesh in meshes]))
