@@ -15,7 +15,7 @@ The data flow, top to bottom::
 Every public name is loaded on first use, so that importing the package costs
 little more than importing photutils.
 """
-from photutils_mgauss.utils.lazy import hand_on
+from photutils_mgauss.utils.lazy import hand_on, offer_formats
 
 try:
     from photutils_mgauss._version import version as __version__
@@ -94,3 +94,7 @@ _OWNERS = {
 
 __getattr__, __dir__, _names = hand_on(__name__, _OWNERS)
 __all__ = ['__version__', *_names]
+
+# Table.read(file, format='mgauss.dolphot') and its likes.
+offer_formats(('hst1pass', 'dolphot', 'daophot', 'starfinder', 'sextractor'),
+              f'{__name__}.files.star_lists', 'read_star_list')

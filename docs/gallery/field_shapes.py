@@ -29,6 +29,4 @@ for ax, name, label in (
         (axes[0], 'size_error', r'$\delta(R^2)/R^2$'),
         (axes[1], 'ellipticity_error', r'$\delta\epsilon$')):
     table = report.table
-    shown = plot_shape_map(ax, table['x'], table['y'], table[name],
-                           label=label)
-    figure.colorbar(shown, ax=ax, label=label)
+    plot_shape_map(table['x'], table['y'], table[name], label=label, ax=ax)

@@ -24,9 +24,9 @@ for axis in (0, 1):  # averaged over the pixel, four samples wide
 
 fit = fit_mixture(image, 3, oversampling=4)
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout='constrained')
-plot_projection(axes[0], fit, image, oversampling=4)
-plot_profile(axes[1], fit, image)
-plot_ellipses(axes[2], fit.mixture)
+plot_projection(fit, image, oversampling=4, ax=axes[0])
+plot_profile(fit, image, ax=axes[1])
+plot_ellipses(fit.mixture, ax=axes[2])
 for ax, title in zip(axes, ('summed along y', 'the brightest row',
                             'one-sigma ellipses'), strict=True):
     ax.set_title(title)

@@ -20,6 +20,4 @@ for axis in (0, 1):  # averaged over the pixel, four samples wide
 
 table = compare_n_components(image, (1, 2, 3, 4, 5), oversampling=4)
 figure, axes = plt.subplots(2, 3, figsize=(8, 5.6), layout='constrained')
-plot_comparison_of_numbers(axes, image, table)
-figure.colorbar(axes[-1, -1].images[0], ax=axes, shrink=0.7,
-                label='residual / peak')
+plot_comparison_of_numbers(image, table, axes=axes)

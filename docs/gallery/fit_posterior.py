@@ -17,8 +17,8 @@ noise = np.random.default_rng(1).normal(0, 2e-4, (17, 17))
 image = truth.render((17, 17), 8, 8) + noise
 
 posterior = sample_mixture(image, 2, draws=300, tune=300, chains=2,
-                           random_seed=1)
+                           rng=1)
 figure, axes = plt.subplots(2, 2, figsize=(9, 5.6), layout='constrained')
-for row, name in zip(axes, ('omega', 'beta'), strict=True):
-    plot_posterior(row[0], posterior, name)
-    plot_trace(row[1], posterior, name)
+for row, name in zip(axes, ('weights', 'stddevs'), strict=True):
+    plot_posterior(posterior, name, ax=row[0])
+    plot_trace(posterior, name, ax=row[1])

@@ -43,12 +43,12 @@ psfs = {k: GriddedMixturePSF.from_gridded_psf(epsfs, n_components=k)
 
 figure, axes = plt.subplots(2, 3, figsize=(13, 7.4), layout='constrained')
 maps, worst = axes
-plot_node_map(maps[0], psfs[3], 'size_error')
-plot_node_map(maps[1], psfs[3], 'phase_error')
-plot_whiskers(maps[2], psfs[3])
+plot_node_map(psfs[3], 'size_error', ax=maps[0])
+plot_node_map(psfs[3], 'phase_error', ax=maps[1])
+plot_whiskers(psfs[3], ax=maps[2])
 maps[2].set_title('ellipticity')
 for ax in maps:
     ax.set_title(ax.get_title().replace(': ', '\n'), fontsize='medium')
 for ax, (k, psf) in zip(worst, psfs.items(), strict=True):
-    plot_worst_node(ax, psf, epsfs)
+    plot_worst_node(psf, epsfs, ax=ax)
     ax.set_title(f'K = {k}\n{ax.get_title()}', fontsize='medium')

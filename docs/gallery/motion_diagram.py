@@ -18,10 +18,10 @@ solution = fitter.fit(epochs)
 
 stars = solution.stars
 figure, axes = plt.subplots(1, 2, figsize=(9.5, 4.4), layout='constrained')
-plot_proper_motions(axes[0], stars)
+plot_proper_motions(stars, ax=axes[0])
 row = {name: i for i, name in enumerate(sources['id'])}
 true = sources[[row[name] for name in stars['id']]]
 some = np.isfinite(stars['pmra'].value) & (true['kind'] == 'star')
-plot_comparison(axes[1], true['pmra'][some].value, stars['pmra'][some].value,
+plot_comparison(true['pmra'][some].value, stars['pmra'][some].value,
                 stars['pmra_error'][some].value, label=r'$\mu_{\alpha*}$',
-                unit='mas / yr')
+                unit='mas / yr', ax=axes[1])

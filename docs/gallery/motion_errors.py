@@ -26,6 +26,7 @@ solutions = [fitter.fit([epochs[i] for i in campaign])
 figure, axes = plt.subplots(1, 2, figsize=(9.5, 4), layout='constrained')
 stars = solutions[-1].stars
 magnitude = dict(zip(sources['id'], sources['mag_g'].value, strict=True))
-plot_motion_errors(axes[0], stars,
-                   np.array([magnitude[name] for name in stars['id']]))
-plot_errors_by_epochs(axes[1], solutions)
+plot_motion_errors(stars,
+                   np.array([magnitude[name] for name in stars['id']]),
+                   ax=axes[0])
+plot_errors_by_epochs(solutions, ax=axes[1])

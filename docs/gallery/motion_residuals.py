@@ -35,6 +35,6 @@ for ax, transform in zip(axes, ('shift', 'poly-3'), strict=True):
     solution = ProperMotionFitter(
         transform=transform, references=quasars, systematic=None,
         clip=None).fit(epochs)
-    plot_residual_vectors(ax, solution, 1)
+    plot_residual_vectors(solution, 1, ax=ax)
     ax.set_title(f"transform='{transform}'\n{ax.get_title()}",
                  fontsize='medium')

@@ -29,5 +29,5 @@ residuals = mas * np.column_stack([table[f'{c}_fit'] - stars[c].value
                                    for c in 'xy'])
 errors = mas * np.column_stack([table[f'{c}_err'] for c in 'xy'])
 figure, ax = plt.subplots(figsize=(6, 4.2), layout='constrained')
-plot_error_curve(ax, stars['mag'].value, residuals, errors, unit='mas')
+plot_error_curve(stars['mag'].value, residuals, errors, unit='mas', ax=ax)
 ax.set_ylim(bottom=0.01)

@@ -40,5 +40,5 @@ for ax, mixture, title in ((axes[0], psf, 'the true PSF'),
     photometry = MixturePSFPhotometry(MultiGaussianPSFModel(mixture), (7, 7),
                                       aperture_radius=3)
     table = photometry(image, error=error, init_params=start)
-    pixel_phase_error(x, table['x_fit']).plot(ax)
+    pixel_phase_error(x, table['x_fit']).plot(ax=ax)
     ax.set_title(title)

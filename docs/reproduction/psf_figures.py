@@ -24,7 +24,7 @@ from photutils_mgauss.plotting import (
 
 FIT = {'oversampling': 2, 'radius': STAMP_RADIUS}
 HALF = 15  # of the stamp that is fitted, 31 samples of 0.037 arcsec across
-PARAMETERS = ('omega', 'alpha', 'beta', 'gamma', 'sigma')
+PARAMETERS = ('weights', 'means', 'stddevs', 'rho', 'sigma')
 
 
 def measure(run):
@@ -102,7 +102,7 @@ def draw_graph(tables):
     """Draw Fig. 2: the Bayesian model."""
     canvas = Canvas(figsize=(9, 3.5), layout='constrained')
     side = len(cut(tables['image']['sample']))
-    plot_model_graph(canvas.subplots(), 3, (side, side))
+    plot_model_graph(3, (side, side), ax=canvas.subplots())
     return canvas
 
 
@@ -113,9 +113,9 @@ def draw_components(tables):
     canvas = Canvas(figsize=(9, 7.5), layout='constrained')
     axes = canvas.subplots(2, 2)
     for ax, axis in zip(axes[0], 'xy', strict=True):
-        plot_projection(ax, fit, stamp, axis=axis, oversampling=2)
-    plot_profile(axes[1, 0], fit, stamp)
-    plot_ellipses(axes[1, 1], fit.mixture)
+        plot_projection(fit, stamp, axis=axis, oversampling=2, ax=ax)
+    plot_profile(fit, stamp, ax=axes[1, 0])
+    plot_ellipses(fit.mixture, ax=axes[1, 1])
     axes[0, 0].set_title('(a) projection on x')
     axes[0, 1].set_title('(a) projection on y')
     axes[1, 0].set_title('(b) brightest row')
@@ -137,10 +137,7 @@ def draw_numbers(tables):
     stamp = cut(tables['image']['sample'])
     table = compare_n_components(stamp, (1, 3, 5), **FIT)
     canvas = Canvas(figsize=(11, 3.2), layout='constrained')
-    axes = canvas.subplots(1, 4)
-    plot_comparison_of_numbers(axes, stamp, table)
-    canvas.colorbar(axes[1].images[0], ax=list(axes),
-                    label='residual / peak')
+    plot_comparison_of_numbers(stamp, table, axes=canvas.subplots(1, 4))
     return canvas
 
 
@@ -179,7 +176,7 @@ def _sample(run, stamp):
     draws = run.settings.draws
     return sample_mixture(stamp, 3, prior='paper', pixel_scale=PIXEL,
                           draws=draws, tune=draws, chains=2, cores=1,
-                          random_seed=1, **FIT)
+                          rng=1, **FIT)
 
 
 def _draws(posterior):
@@ -197,11 +194,9 @@ def draw_posterior(tables):
     for name, (left, right) in zip(PARAMETERS, canvas.subplots(5, 2),
                                    strict=True):
         left.set_prop_cycle(color=COLOURS)
-        plot_posterior(left, posterior, name)
-        plot_trace(right, posterior, name)
-        label = f'{name} [pix]' if name in ('alpha', 'beta') else name
-        left.set_xlabel(label)
-        right.set(xlabel='every second draw', ylabel=label)
+        plot_posterior(posterior, name, ax=left)
+        plot_trace(posterior, name, ax=right)
+        right.set_xlabel('every second draw')
         left.locator_params(axis='x', nbins=6)
         for ax in (left, right):
             ax.legend(fontsize=6, ncols=2)

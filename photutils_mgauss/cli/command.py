@@ -8,6 +8,7 @@ from photutils_mgauss import __version__
 from photutils_mgauss.cli import (
     compile_command,
     demo_command,
+    info,
     motions,
     photometry,
     psf,
@@ -15,7 +16,8 @@ from photutils_mgauss.cli import (
 )
 from photutils_mgauss.cli.running import run_command
 
-_COMMANDS = (psf, photometry, motions, report, demo_command, compile_command)
+_COMMANDS = (psf, photometry, motions, report, info, demo_command,
+             compile_command)
 
 _EPILOG = """\
 From two images to proper motions and a page that shows them:
@@ -45,7 +47,7 @@ def main(argv=None):
         The exit code: 0 if all went well, 1 if an error was reported, 130 if
         the command was interrupted.
     """
-    parser = _parser()
+    parser = make_parser()
     words = sys.argv[1:] if argv is None else list(argv)
     options, unknown = parser.parse_known_args(words)
     if unknown:
@@ -61,7 +63,8 @@ def _unknown(parser, words):
     return f'{text} (did you mean {near[0]}?)' if near else text
 
 
-def _parser():
+def make_parser():
+    """Return the parser, from which shells can learn what completes words."""
     parser = argparse.ArgumentParser(
         prog='mgauss', description='Positions, fluxes and proper motions '
         'with PSFs made of Gaussians.', epilog=_EPILOG,

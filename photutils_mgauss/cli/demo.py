@@ -242,9 +242,9 @@ def plot_positions(result, axes):
                          strict=True):
         stars = epoch.residuals()
         scale = 1000 * epoch.scene.instrument.pixel_scale
-        plot_error_curve(ax, stars['mag'].value,
+        plot_error_curve(stars['mag'].value,
                          scale * stars['delta'].value,
-                         scale * stars['error'].value, unit='mas')
+                         scale * stars['error'].value, unit='mas', ax=ax)
         ax.set_title(f'{epoch.scene.time.isot[:10]}, band '
                      f'{epoch.scene.exposure.band.name}')
 
@@ -254,6 +254,6 @@ def plot_motions(result, axes):
     from photutils_mgauss.plotting import plot_comparison
     stars = result.matched
     for ax, name in zip(axes, ('pmra', 'pmdec'), strict=True):
-        plot_comparison(ax, stars[f'{name}_true'].value, stars[name].value,
+        plot_comparison(stars[f'{name}_true'].value, stars[name].value,
                         stars[f'{name}_error'].value, label=name,
-                        unit='mas/yr')
+                        unit='mas/yr', ax=ax)

@@ -8,7 +8,12 @@ from photutils_mgauss.cli import photometry, pixel_motions, tools
 from photutils_mgauss.cli import psf as psf_command
 from photutils_mgauss.cli.observers import check_observer, observer_at
 from photutils_mgauss.cli.progress import Progress
-from photutils_mgauss.cli.results import Results, add_checkpoint, file_marks
+from photutils_mgauss.cli.results import (
+    Results,
+    add_checkpoint,
+    add_dry_run,
+    file_marks,
+)
 
 _TABLE_SUFFIXES = ('.ecsv', '.csv', '.txt', '.dat', '.vot', '.xml', '.votable')
 
@@ -44,6 +49,7 @@ def add(commands):
     photometry.add_measuring(parser)
     tools.add_reading(parser)
     add_checkpoint(parser)
+    add_dry_run(parser)
     tools.add_overwrite(parser)
     parser.set_defaults(grid_shape=[30, 30])
 
@@ -115,6 +121,8 @@ def run(options):
         epochs = [_from_catalogue(options, i) if are_tables[i]
                   else _check_image(options, read(i))
                   for i in range(len(paths))]
+        if results.only_planned():
+            return
         for i, path in enumerate(paths):
             step(f'measure {path}' if epochs[i] is None else f'use {path}')
             if epochs[i] is None:

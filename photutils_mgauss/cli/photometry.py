@@ -7,7 +7,12 @@ from pathlib import Path
 from photutils_mgauss.cli import psf as psf_command
 from photutils_mgauss.cli import tools
 from photutils_mgauss.cli.progress import Progress
-from photutils_mgauss.cli.results import Results, add_checkpoint, file_marks
+from photutils_mgauss.cli.results import (
+    Results,
+    add_checkpoint,
+    add_dry_run,
+    file_marks,
+)
 
 _SUFFIXES = ('.ecsv', '.fits')
 
@@ -41,6 +46,7 @@ def add(commands):
     tools.add_times(parser)
     tools.add_reading(parser)
     add_checkpoint(parser)
+    add_dry_run(parser)
     tools.add_overwrite(parser)
 
 
@@ -81,6 +87,8 @@ def run(options):
                 for path in dict.fromkeys(options.psf)}
         for i in range(len(paths)):
             psf_command.check_image(read(i))
+        if results.only_planned():
+            return
         for i, name in enumerate(names):
             step(f'measure {paths[i]}')
             image = read(i)
@@ -184,8 +192,7 @@ def _fwhm(psf, shape):
     """Return the width of the PSF in the middle of the image [pix]."""
     from photutils_mgauss.psf.shapes import adaptive_moments
     ny, nx = shape
-    r2 = float(adaptive_moments(psf.mixture_at(nx / 2, ny / 2)).r2)
-    return 2.3548 * (r2 / 2) ** 0.5
+    return float(adaptive_moments(psf.mixture_at(nx / 2, ny / 2)).fwhm)
 
 
 def _with_unit(table, unit):

@@ -58,6 +58,8 @@ def run(options):
             marks.append([file_marks(path, owners[i], frame),
                           image.content])
             tools.say(options, f'{path}: {epochs[i]!r}')
+        if results.only_planned():
+            return
         step('find and fit stars')
         solve = cache(partial(_solve, options, epochs))
         key = results.key(marks, file_marks(options.targets))

@@ -3,7 +3,12 @@ from functools import partial
 
 from photutils_mgauss.cli import tools
 from photutils_mgauss.cli.progress import Progress
-from photutils_mgauss.cli.results import Results, add_checkpoint, file_marks
+from photutils_mgauss.cli.results import (
+    Results,
+    add_checkpoint,
+    add_dry_run,
+    file_marks,
+)
 
 _SUFFIXES = ('.fits', '.asdf')
 
@@ -30,6 +35,7 @@ def add(commands):
     _add_files(parser)
     tools.add_reading(parser)
     add_checkpoint(parser)
+    add_dry_run(parser)
     tools.add_overwrite(parser)
 
 
@@ -79,6 +85,8 @@ def run(options):
         step('look at all files')
         kinds = [_kind(options, path, lambda i=i: read(i))
                  for i, path in enumerate(paths)]
+        if results.only_planned():
+            return
         for i, (path, name) in enumerate(zip(paths, names, strict=True)):
             step(f'PSF of {path}')
             image = read(i) if kinds[i] == 'image' else None

@@ -20,6 +20,13 @@ def add_checkpoint(parser):
                              'command goes on where it was stopped')
 
 
+def add_dry_run(parser):
+    """Add the option for checking everything and making nothing."""
+    parser.add_argument('--dry-run', action='store_true',
+                        help='check options and files, say what would be '
+                             'written, and stop')
+
+
 class Results:
     """
     The results of one command.
@@ -33,6 +40,7 @@ class Results:
     def __init__(self, options):
         self._options = options
         self._files = []
+        self._claimed = []
         self.folder = options.checkpoint and Path(options.checkpoint)
         if self.folder and self.folder.exists() and not self.folder.is_dir():
             msg = f'{self.folder}: --checkpoint must be a folder, not a file'
@@ -42,8 +50,16 @@ class Results:
         """Raise unless the files can be written; see `tools.claim`."""
         new = [name for name in names if not self._is_ours(name)]
         tools.claim(new, self._options.overwrite, inputs)
+        self._claimed = list(names)
         if self.folder:
             tools.check_folder(self.folder)
+
+    def only_planned(self):
+        """Say what would be written and return True in a dry run."""
+        if self._options.dry_run:
+            tools.say(self._options, *(f'would write {name}'
+                                       for name in self._claimed))
+        return self._options.dry_run
 
     def _is_ours(self, name):
         """Whether a file was copied from the folder, by an earlier run."""

@@ -20,7 +20,7 @@ def psf_section(path):
     psf, record = read_psf(path), psf_record(path)
     middle = psf.grid_xypos.mean(axis=0)
     shapes = adaptive_moments(psf.mixtures)
-    fwhm = 2.3548 * np.sqrt(np.atleast_1d(shapes.r2) / 2)
+    fwhm = np.atleast_1d(shapes.fwhm)
     facts = {'Nodes': ' x '.join(str(n) for n in psf.grid_shape[::-1]),
              'Gaussians at a node': psf.n_components,
              'FWHM, median [pix]': f'{np.median(fwhm):.3f}',
@@ -31,7 +31,7 @@ def psf_section(path):
         if record.get(name):
             value = record[name]
             facts[words] = f'{value:.2g}' if name == 'accuracy' else value
-    panels = [Panel(lambda ax: plotting.plot_psf_image(ax, psf, *middle),
+    panels = [Panel(lambda ax: plotting.plot_psf_image(psf, *middle, ax=ax),
                     'The PSF in the middle of the detector.')]
     if len(psf.grid_xypos) > 1:
         panels += _maps(psf, record.get('stars'))
@@ -42,15 +42,15 @@ def psf_section(path):
 def _maps(psf, stars):
     coarse = _thinned(psf)
     panels = [
-        Panel(lambda ax: plotting.plot_width_map(ax, psf, stars=stars),
+        Panel(lambda ax: plotting.plot_width_map(psf, stars=stars, ax=ax),
               'The width of the PSF over the detector'
               + (', and the stars it was made of.' if stars else '.')),
-        Panel(lambda ax: plotting.plot_whiskers(ax, coarse),
+        Panel(lambda ax: plotting.plot_whiskers(coarse, ax=ax),
               'The ellipticity of the PSF, as whiskers along its long '
               'axis.')]
     if np.isfinite(np.asarray(psf.report['size_error'], float)).any():
         panels.append(Panel(
-            lambda ax: plotting.plot_node_map(ax, psf, 'size_error'),
+            lambda ax: plotting.plot_node_map(psf, 'size_error', ax=ax),
             'How much larger the images were than the mixtures fitted to '
             'them.'))
     return panels
@@ -98,10 +98,10 @@ def _star_panels(table, good):
               for name in ('x_err', 'y_err')}
     x, y = column_values(table, 'x_fit'), column_values(table, 'y_fit')
     panels = [
-        Panel(lambda ax: plotting.plot_detections(ax, x, y, flux),
+        Panel(lambda ax: plotting.plot_detections(x, y, flux, ax=ax),
               'The stars, brighter ones larger.'),
         Panel(lambda ax: plotting.plot_stated_errors(
-            ax, magnitude[good], errors, unit='pix', label=label),
+            magnitude[good], errors, unit='pix', label=label, ax=ax),
             'Errors of position against magnitude, of stars without flags.')]
     if 'reduced_chi2' in table.colnames:
         chi2 = {'reduced chi2': column_values(table, 'reduced_chi2')[good]}
@@ -113,7 +113,7 @@ def _star_panels(table, good):
 
 
 def _chi2(ax, magnitude, chi2, label):
-    plotting.plot_stated_errors(ax, magnitude, chi2, unit='', label=label)
+    plotting.plot_stated_errors(magnitude, chi2, unit='', label=label, ax=ax)
     ax.set_ylabel('reduced chi2')
     ax.axhline(1, color=BLACK, linewidth=0.8)
 
@@ -146,7 +146,7 @@ def motion_section(path, table, record):
 
 def _motion_panels(table, solved, free):
     panels = [Panel(lambda ax: plotting.plot_proper_motions(
-        ax, table[solved]), 'The proper motions.')]
+        table[solved], ax=ax), 'The proper motions.')]
     # The motions of references are what a catalogue says.
     stars = table[solved & free]
     with np.errstate(invalid='ignore', divide='ignore'):
@@ -159,8 +159,8 @@ def _motion_panels(table, solved, free):
     if np.isfinite(magnitude).any():
         panels.append(Panel(
             lambda ax: plotting.plot_stated_errors(
-                ax, magnitude, errors, unit=str(table['pmra'].unit),
-                label='-2.5 log flux [mag]'),
+                magnitude, errors, unit=str(table['pmra'].unit),
+                label='-2.5 log flux [mag]', ax=ax),
             'Errors of the motions of stars against magnitude.'))
     return tuple(panels)
 
@@ -198,7 +198,7 @@ def residual_section(path, table, record):
     shown = SimpleNamespace(residuals=rows)
     epochs, counts = np.unique(np.asarray(rows['epoch']), return_counts=True)
     panels = [Panel(lambda ax, epoch=epoch: plotting.plot_residual_vectors(
-        ax, shown, epoch), f'Residuals of epoch {epoch}.')
+        shown, epoch, ax=ax), f'Residuals of epoch {epoch}.')
         for epoch in epochs[counts > 1].tolist()]
     return Section(
         f'Residuals: {path}', panels=tuple(panels), record=record,

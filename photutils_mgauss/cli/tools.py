@@ -18,7 +18,8 @@ from photutils_mgauss import __version__
 from photutils_mgauss.files import whole
 
 # What is no option of a run.
-NOT_STORED = ('run', 'parser', 'quiet', 'log_file', 'overwrite')
+NOT_STORED = ('run', 'parser', 'quiet', 'log_file', 'overwrite',
+              'dry_run')
 # What is wrong is said in no more letters than these.
 _LONGEST = 500
 # Errors of these kinds are sentences already.

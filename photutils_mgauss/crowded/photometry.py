@@ -254,6 +254,15 @@ class CrowdedMixturePhotometry:
         self.psf_used = psf_model
         self._psf = None if psf_model is None else LocalPSF.of(psf_model)
 
+    def __repr__(self):
+        psf = ('PSF from the image' if self.psf_model is None
+               else repr(self.psf_model))
+        found = ('' if self.results is None
+                 else f', {len(self.results)} stars measured last')
+        return (f'<CrowdedMixturePhotometry({psf}, threshold='
+                f'{self.threshold:g}, background_size='
+                f'{self.background_size}){found}>')
+
     def __call__(self, data, *, mask=None, error=None, init_params=None):
         """
         Find and fit the stars of an image.

@@ -11,6 +11,7 @@ from photutils_mgauss.field.normal import model_stamps, to_vector
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.image import with_unit
+from photutils_mgauss.utils.notebook import with_picture
 from photutils_mgauss.utils.star_columns import words_column
 from photutils_mgauss.utils.validation import as_real
 
@@ -81,24 +82,28 @@ class Field(ComparedByValue):
         radius = as_real(radius, 'radius', above=0)
         return 1 / self.mixture_at(x, y).encircled_energy(radius)
 
-    def plot(self, ax, quantity='size', **options):
+    def plot(self, quantity='size', *, n=20, ax=None):
         """
-        Draw the field on the Axes given.
+        Draw how the PSF varies over the detector.
 
         Parameters
         ----------
-        ax : `~matplotlib.axes.Axes`
         quantity : {'size', 'ellipticity', 'residual'}, optional
             See `photutils_mgauss.plotting.plot_field`.
-        **options
-            Its keywords.
+        n : int, optional
+            The number of places along the longer side.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw; None is pyplot's current Axes.
 
         Returns
         -------
-        `~matplotlib.artist.Artist`
+        `~matplotlib.axes.Axes`
         """
         from photutils_mgauss.plotting import plot_field
-        return plot_field(ax, self, quantity, **options)
+        return plot_field(self, quantity, n=n, ax=ax)
+
+    def _repr_html_(self):
+        return with_picture(repr(self), lambda ax: self.plot(ax=ax))
 
 
 def nodes(n, size):

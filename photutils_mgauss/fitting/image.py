@@ -9,6 +9,7 @@ pixels of a PSF of unit flux sum to :math:`s_x s_y`, as in photutils.
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import partial
+from html import escape
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from photutils_mgauss.fitting.search import (
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.image import check_errors, read_stack, with_unit
+from photutils_mgauss.utils.notebook import with_picture
 from photutils_mgauss.utils.parallel import map_chunks
 from photutils_mgauss.utils.validation import (
     as_choice,
@@ -166,6 +168,35 @@ class MixtureFit(ComparedByValue):
         n = self.mixture.n_components if self.mixture else 0
         return (f'<MixtureFit of {n} Gaussians, flux {self.flux:.6g}, chi2 '
                 f'{self.chi2:.6g}: {self.message}>')
+
+    def _repr_html_(self):
+        if self.mixture is None:
+            return f'<p><code>{escape(repr(self))}</code></p>'
+        return with_picture(repr(self), lambda ax: self.plot(ax=ax))
+
+    def plot(self, *, ax=None):
+        """
+        Show the residual image as a fraction of the model's peak.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw; None is pyplot's current Axes.
+
+        Returns
+        -------
+        `~matplotlib.axes.Axes`
+
+        Raises
+        ------
+        ValueError
+            If there is no mixture.
+        """
+        from photutils_mgauss.plotting import plot_residual
+        if self.mixture is None:
+            msg = f'a fit without a mixture cannot be drawn: {self.message}'
+            raise ValueError(msg)
+        return plot_residual(self, ax=ax)
 
 
 def fit_with_unit(fit, unit):

@@ -113,7 +113,10 @@ def select_n_components(image, n_components=(1, 2, 3, 4, 5), *,
                         rms_residual=None, max_residual=None,
                         phase_error=None, **kwargs):
     """
-    Return the smallest number of Gaussians that meets thresholds.
+    Return the number of Gaussians an image needs.
+
+    That is the smallest that meets the thresholds given; without thresholds,
+    the one with the smallest Bayesian information criterion.
 
     Parameters
     ----------
@@ -124,26 +127,31 @@ def select_n_components(image, n_components=(1, 2, 3, 4, 5), *,
     r2_error, ellipticity_error, rms_residual, max_residual, phase_error : \
 float, optional
         Upper limits of the absolute values of these columns of
-        `compare_n_components`; at least one.
+        `compare_n_components`.
     **kwargs
         The keywords of `fit_mixture`.
 
     Returns
     -------
     int
-        The smallest K that meets all of them.
+        The number K.
 
     Raises
     ------
     ValueError
-        If no threshold is given, or none of the numbers meets them all.
+        If none of the numbers meets all thresholds.
 
     Examples
     --------
+    >>> import numpy as np
     >>> from photutils_mgauss import GaussianMixture, select_n_components
     >>> truth = GaussianMixture([0.8, 0.2], [[0, 0], [0.1, 0]],
     ...                         [[[1, 0.1], [0.1, 1]], [[4, 0], [0, 5]]])
-    >>> select_n_components(truth.render(21, 10, 10), max_residual=0.01)
+    >>> image = truth.render(21, 10, 10)
+    >>> select_n_components(image, max_residual=0.01)
+    2
+    >>> noise = 1e-4 * np.random.default_rng(1).standard_normal(image.shape)
+    >>> select_n_components(image + noise, error=1e-4)
     2
     """
     given = (r2_error, ellipticity_error, rms_residual, max_residual,
@@ -152,8 +160,8 @@ float, optional
               for name, value in zip(_CRITERIA, given, strict=True)
               if value is not None}
     if not limits:
-        msg = f'one of {", ".join(_CRITERIA)} must be given, got none'
-        raise ValueError(msg)
+        table = compare_n_components(image, n_components, **kwargs)
+        return int(table['n_components'][np.argmin(table['bic'])])
     for k in sorted(_as_numbers(n_components)):
         row = compare_n_components(image, [k], **kwargs)[0]
         if all(abs(row[name]) <= limit for name, limit in limits.items()):

@@ -24,7 +24,13 @@ from photutils_mgauss.fitting.image import (
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.image import read_pixels, with_unit
-from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
+from photutils_mgauss.utils.notebook import with_table
+from photutils_mgauss.utils.validation import (
+    as_choice,
+    as_integer,
+    as_real,
+    as_rng,
+)
 
 __all__ = ['MixturePosterior', 'sample_mixture']
 
@@ -44,14 +50,14 @@ class MixturePosterior:
 
     Attributes
     ----------
-    omega : (c, d, K) `~numpy.ndarray`
-        Weights.
-    alpha : (c, d, K, 2) `~numpy.ndarray`
-        Means (x, y) relative to the origin [pix].
-    beta : (c, d, K, 2) `~numpy.ndarray`
-        Standard deviations along x and y [pix].
-    gamma : (c, d, K) `~numpy.ndarray`
-        Correlation coefficients.
+    weights : (c, d, K) `~numpy.ndarray`
+        The fraction of the flux in each Gaussian, the paper's omega.
+    means : (c, d, K, 2) `~numpy.ndarray`
+        The centres (x, y) relative to the origin [pix], alpha.
+    stddevs : (c, d, K, 2) `~numpy.ndarray`
+        Standard deviations along x and y [pix], beta.
+    rho : (c, d, K) `~numpy.ndarray`
+        Correlation coefficients, gamma.
     flux : (c, d) `~numpy.ndarray`
         The total flux.
     sigma : (c, d) `~numpy.ndarray`
@@ -60,8 +66,8 @@ class MixturePosterior:
     fit : MixtureFit
         The least-squares solution the chains started from.
     idata : `arviz.InferenceData` or `xarray.DataTree`
-        What PyMC returned: labels as sampled, lengths in arcsec for the
-        paper's priors, fluxes relative to ``fit.flux``.
+        What PyMC returned: the paper's names, labels as sampled, lengths in
+        arcsec for the paper's priors, fluxes relative to ``fit.flux``.
 
     Examples
     --------
@@ -75,10 +81,10 @@ class MixturePosterior:
     >>> fit = fit_mixture(psf.render((15, 15), 7, 7), 1)
     >>> noise = 0.01 * np.random.default_rng(1).standard_normal((2, 50, 1))
     >>> posterior = MixturePosterior(
-    ...     omega=np.ones((2, 50, 1)),
-    ...     alpha=np.stack([noise, -noise], axis=-1),
-    ...     beta=np.sqrt(2) + np.stack([noise, noise], axis=-1),
-    ...     gamma=noise, flux=1 + noise[..., 0],
+    ...     weights=np.ones((2, 50, 1)),
+    ...     means=np.stack([noise, -noise], axis=-1),
+    ...     stddevs=np.sqrt(2) + np.stack([noise, noise], axis=-1),
+    ...     rho=noise, flux=1 + noise[..., 0],
     ...     sigma=0.1 + 0 * noise[..., 0], fit=fit, idata=None)
     >>> posterior
     <MixturePosterior of 1 Gaussians, 2 chains of 50 draws>
@@ -88,33 +94,36 @@ class MixturePosterior:
     10
     >>> table = posterior.summary()
     >>> table['parameter'][:3].tolist()
-    ['omega_1', 'alpha_x_1', 'alpha_y_1']
+    ['weight_1', 'x_mean_1', 'y_mean_1']
     >>> bool(table['r_hat'][1] < 1.05)
     True
     """
 
-    omega: np.ndarray
-    alpha: np.ndarray
-    beta: np.ndarray
-    gamma: np.ndarray
+    weights: np.ndarray
+    means: np.ndarray
+    stddevs: np.ndarray
+    rho: np.ndarray
     flux: np.ndarray
     sigma: np.ndarray
     fit: MixtureFit
     idata: object = field(repr=False)
 
     def __repr__(self):
-        chains, draws, k = self.omega.shape
+        chains, draws, k = self.weights.shape
         return (f'<MixturePosterior of {k} Gaussians, {chains} chains of '
                 f'{draws} draws>')
+
+    def _repr_html_(self):
+        return with_table(repr(self), self.summary())
 
     @property
     def mixture(self):
         """The mixture whose parameters are the posterior means."""
         mean = (0, 1)
-        weights = self.omega.mean(axis=mean)
+        weights = self.weights.mean(axis=mean)
         return GaussianMixture.from_stddevs(
-            weights / weights.sum(), self.alpha.mean(axis=mean),
-            self.beta.mean(axis=mean), self.gamma.mean(axis=mean))
+            weights / weights.sum(), self.means.mean(axis=mean),
+            self.stddevs.mean(axis=mean), self.rho.mean(axis=mean))
 
     def draws(self, n):
         """
@@ -134,13 +143,13 @@ class MixturePosterior:
         ValueError
             If there are fewer draws than that.
         """
-        omega, alpha, beta, gamma = (
+        weights, means, stddevs, rho = (
             a.reshape(-1, *a.shape[2:])
-            for a in (self.omega, self.alpha, self.beta, self.gamma))
-        n = as_integer(n, 'n', minimum=1, maximum=len(omega))
-        chosen = np.linspace(0, len(omega) - 1, n).round().astype(int)
+            for a in (self.weights, self.means, self.stddevs, self.rho))
+        n = as_integer(n, 'n', minimum=1, maximum=len(weights))
+        chosen = np.linspace(0, len(weights) - 1, n).round().astype(int)
         return [GaussianMixture.from_stddevs(
-            omega[i] / omega[i].sum(), alpha[i], beta[i], gamma[i])
+            weights[i] / weights[i].sum(), means[i], stddevs[i], rho[i])
             for i in chosen]
 
     def parameters(self):
@@ -150,18 +159,19 @@ class MixturePosterior:
         Returns
         -------
         dict of str to (c, d) `~numpy.ndarray`
-            ``omega_k``, ``alpha_x_k``, ``alpha_y_k``, ``beta_x_k``,
-            ``beta_y_k`` and ``gamma_k`` for k = 1 to K, ``flux``, ``sigma``.
+            ``weight_k`` and, named as in `MultiGaussianPSFModel`,
+            ``x_mean_k``, ``y_mean_k``, ``x_stddev_k``, ``y_stddev_k`` and
+            ``rho_k`` for k = 1 to K; ``flux``, ``sigma``.
         """
         columns = {}
-        for k in range(self.omega.shape[2]):
+        for k in range(self.weights.shape[2]):
             columns |= {
-                f'omega_{k + 1}': self.omega[..., k],
-                f'alpha_x_{k + 1}': self.alpha[..., k, 0],
-                f'alpha_y_{k + 1}': self.alpha[..., k, 1],
-                f'beta_x_{k + 1}': self.beta[..., k, 0],
-                f'beta_y_{k + 1}': self.beta[..., k, 1],
-                f'gamma_{k + 1}': self.gamma[..., k]}
+                f'weight_{k + 1}': self.weights[..., k],
+                f'x_mean_{k + 1}': self.means[..., k, 0],
+                f'y_mean_{k + 1}': self.means[..., k, 1],
+                f'x_stddev_{k + 1}': self.stddevs[..., k, 0],
+                f'y_stddev_{k + 1}': self.stddevs[..., k, 1],
+                f'rho_{k + 1}': self.rho[..., k]}
         return columns | {'flux': np.asarray(self.flux),
                           'sigma': np.asarray(self.sigma)}
 
@@ -185,11 +195,27 @@ class MixturePosterior:
         return QTable(rows=rows, names=('parameter', 'mean', 'std', 'q16',
                                         'q50', 'q84', 'r_hat', 'ess'))
 
+    def plot(self, names=None, *, axes=None):
+        """
+        Draw the posterior of each parameter, and of each pair of them.
+
+        Parameters
+        ----------
+        names, axes
+            See `photutils_mgauss.plotting.plot_corner`.
+
+        Returns
+        -------
+        (n, n) `~numpy.ndarray` of `~matplotlib.axes.Axes`
+        """
+        from photutils_mgauss.plotting import plot_corner
+        return plot_corner(self, names, axes=axes)
+
 
 def sample_mixture(image, n_components=3, *, prior='scaled',
                    pixel_scale=None, draws=1000, tune=500, chains=4,
-                   sampler='pymc', cores=None, progressbar=False,
-                   random_seed=None, **kwargs):
+                   sampler='pymc', cores=None, progress_bar=False, rng=None,
+                   **kwargs):
     r"""
     Sample the posterior of the mixture that an image is, with PyMC.
 
@@ -225,15 +251,16 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
         Whose NUTS; the last two where they are installed.
     cores : int, optional
         Processes to run chains in; None is PyMC's choice.
-    progressbar : bool, optional
+    progress_bar : bool, optional
         Whether PyMC shows its progress.
-    random_seed : int, optional
+    rng : int or `~numpy.random.Generator`, optional
         Makes the result repeatable.
     **kwargs
         The keywords of `fit_mixture`, which finds where to start:
         ``oversampling``, ``origin``, ``error``, ``mask``, ``radius``,
         ``enclosed_flux``, ``normalize``, ``start``. The model has positive
-        weights and free means, so the others are refused.
+        weights and free means, so the others are refused. PyMC's own word
+        for ``rng``, ``random_seed``, is taken in its place.
 
     Returns
     -------
@@ -269,12 +296,13 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
     >>> rng = np.random.default_rng(1)
     >>> image = psf.render((9, 9), 4, 4) + rng.normal(0, 1e-3, (9, 9))
     >>> posterior = sample_mixture(image, 1, draws=20, tune=20, chains=1,
-    ...                            random_seed=1)  # doctest: +SKIP
+    ...                            rng=1)  # doctest: +SKIP
     >>> posterior  # doctest: +SKIP
     <MixturePosterior of 1 Gaussians, 1 chains of 20 draws>
     >>> posterior.mixture.stddevs.round(1)  # doctest: +SKIP
     array([[1.2, 1. ]])
     """
+    rng = kwargs.pop('random_seed', rng)
     _check_keywords(kwargs)
     pixels = read_pixels(image, kwargs.pop('error', None),
                          kwargs.pop('mask', None), name='image',
@@ -301,9 +329,9 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
     draws = as_integer(draws, 'draws', minimum=4)
     data = _Data.prepare(image, fit, prior, unit, kwargs)
     model = _build(data)
-    idata = _sample(model, sampler, progressbar=progressbar, cores=cores,
-                    random_seed=random_seed,
-                    draws=draws,
+    seed = None if rng is None else int(as_rng(rng).integers(2**31))
+    idata = _sample(model, sampler, progressbar=progress_bar, cores=cores,
+                    random_seed=seed, draws=draws,
                     tune=as_integer(tune, 'tune', minimum=0),
                     chains=as_integer(chains, 'chains', minimum=1))
     return _posterior(idata, data, fit, pixels.unit)

@@ -24,6 +24,7 @@ from photutils_mgauss.motions.tables import (
     validation_table,
 )
 from photutils_mgauss.sky.observers import julian_years, tdb
+from photutils_mgauss.utils.notebook import with_table
 from photutils_mgauss.utils.validation import as_integer
 
 
@@ -140,6 +141,9 @@ class MotionSolution:
         return (f'<MotionSolution: {solved} of {len(self.stars)} stars, '
                 f'{len(self.epochs)} epochs>')
 
+    def _repr_html_(self):
+        return with_table(repr(self), self.stars)
+
     @cached_property
     def residuals(self):
         """
@@ -250,39 +254,39 @@ class MotionSolution:
         n = as_integer(n_resamples, 'n_resamples', minimum=1)
         return bootstrap_frames(self._fit, n, rng)
 
-    def plot_residuals(self, ax, epoch):
+    def plot_residuals(self, epoch, *, ax=None):
         """
         Draw the residuals of one epoch as arrows.
 
         Parameters
         ----------
-        ax : `~matplotlib.axes.Axes`
-            Where to draw, and what is returned.
         epoch : int
             Number of the epoch, from 0.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw; None is pyplot's current Axes.
 
         Returns
         -------
         `~matplotlib.axes.Axes`
         """
         from photutils_mgauss.plotting import plot_residual_vectors
-        return plot_residual_vectors(ax, self, epoch)
+        return plot_residual_vectors(self, epoch, ax=ax)
 
-    def plot_motions(self, ax):
+    def plot(self, *, ax=None):
         """
         Plot the proper-motion diagram.
 
         Parameters
         ----------
-        ax : `~matplotlib.axes.Axes`
-            Where to draw, and what is returned.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw; None is pyplot's current Axes.
 
         Returns
         -------
         `~matplotlib.axes.Axes`
         """
         from photutils_mgauss.plotting import plot_proper_motions
-        return plot_proper_motions(ax, self.stars)
+        return plot_proper_motions(self.stars, ax=ax)
 
     @property
     def _year(self):

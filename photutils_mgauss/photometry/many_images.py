@@ -72,8 +72,8 @@ def add_sky_positions(table, wcs):
     Returns
     -------
     `~astropy.table.QTable`
-        A copy with the columns ``ra`` and ``dec`` [deg] (ICRS), ``ra_err``
-        (along the parallel, that is, times cos dec), ``dec_err`` [mas] and
+        A copy with the columns ``ra`` and ``dec`` [deg] (ICRS), ``ra_error``
+        (along the parallel, that is, times cos dec), ``dec_error`` [mas] and
         ``radec_cov`` [mas^2].
 
     Raises
@@ -92,7 +92,7 @@ def add_sky_positions(table, wcs):
     >>> stars = QTable({'x_fit': [-1.0], 'y_fit': [-1.0], 'x_err': [0.1],
     ...                 'y_err': [0.2]})
     >>> sky = add_sky_positions(stars, wcs)
-    >>> sky['ra_err'], sky['dec_err']
+    >>> sky['ra_error'], sky['dec_error']
     (<Quantity [3.6] mas>, <Quantity [7.2] mas>)
     """
     check_celestial(wcs)
@@ -222,8 +222,8 @@ def _add_columns(table, vectors, plane, covariance):
     covariance = _turn(covariance, to_local)
     ra, dec = directions(vectors)
     table['ra'], table['dec'] = ra * u.deg, dec * u.deg
-    table['ra_err'] = np.sqrt(covariance[:, 0, 0]) * u.mas
-    table['dec_err'] = np.sqrt(covariance[:, 1, 1]) * u.mas
+    table['ra_error'] = np.sqrt(covariance[:, 0, 0]) * u.mas
+    table['dec_error'] = np.sqrt(covariance[:, 1, 1]) * u.mas
     table['radec_cov'] = covariance[:, 0, 1] * u.mas**2
 
 
@@ -251,7 +251,7 @@ def fit_many(images, coordinates, *, fit_shape=11, common_flux=False):
     Returns
     -------
     `~astropy.table.QTable`
-        ``id``, ``ra``, ``dec`` [deg], ``ra_err``, ``dec_err`` [mas],
+        ``id``, ``ra``, ``dec`` [deg], ``ra_error``, ``dec_error`` [mas],
         ``radec_cov`` [mas^2], ``flux_fit`` and ``flux_err`` ((n, images), or
         (n,) for a common flux; NaN where an image does not show the star),
         ``n_pixels_fit``, ``reduced_chi2`` and ``converged``. Errors are from

@@ -44,20 +44,21 @@ class PixelPhaseError:
         """Half of what lies between the extreme medians [pix]."""
         return float(np.nanmax(self.median) - np.nanmin(self.median)) / 2
 
-    def plot(self, ax):
+    def plot(self, *, ax=None):
         """
         Draw the errors against the phase.
 
         Parameters
         ----------
-        ax : `~matplotlib.axes.Axes`
-            Where to draw.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw; None is pyplot's current Axes.
 
         Returns
         -------
         `~matplotlib.axes.Axes`
-            The same.
         """
+        from photutils_mgauss.plotting.style import current_axes
+        ax = current_axes(ax)
         ax.axhline(0, color='0.7', zorder=0)
         ax.errorbar(self.phase, 1e3 * self.median, 1e3 * self.error, fmt='o-')
         ax.set(xlabel='pixel phase [pix]', ylabel='median error [mpix]',

@@ -13,6 +13,7 @@ from photutils_mgauss.pixel_motions.stars import StarList
 from photutils_mgauss.pixel_motions.tables import flux_table
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.sky.observers import tdb
+from photutils_mgauss.utils.notebook import with_table
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +71,25 @@ class PixelMotionSolution:
         solved = int(np.isfinite(self.stars['ra']).sum())
         return (f'<PixelMotionSolution: {solved} of {len(self.stars)} stars, '
                 f'{len(self.images)} images>')
+
+    def _repr_html_(self):
+        return with_table(repr(self), self.stars)
+
+    def plot(self, *, ax=None):
+        """
+        Plot the proper-motion diagram.
+
+        Parameters
+        ----------
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw; None is pyplot's current Axes.
+
+        Returns
+        -------
+        `~matplotlib.axes.Axes`
+        """
+        from photutils_mgauss.plotting import plot_proper_motions
+        return plot_proper_motions(self.stars, ax=ax)
 
     @cached_property
     def fluxes(self):

@@ -1,17 +1,19 @@
 """
-All figures, drawn on the Axes they are given.
+All figures, drawn on the Axes they are given or on pyplot's current ones.
 
 One module for each kind of result: `fit` shows a mixture beside the image it
 was fitted to, `grid` a PSF over a detector, `field` a field and its stars,
 `posterior` the draws of PyMC, `stars` measured stars, and `motions` epochs
 and proper motions; `style` has their colours. Every function imports
 matplotlib when it is called, takes the numbers it draws as public objects or
-tables, computes none itself, and leaves saving and showing to the caller.
+tables, computes none itself, takes ``ax=None`` and returns the Axes, and
+leaves saving and showing to the caller.
 """
 from photutils_mgauss.plotting.field import plot_field
 from photutils_mgauss.plotting.fit import (
     plot_comparison_of_numbers,
     plot_ellipses,
+    plot_mixture,
     plot_profile,
     plot_projection,
     plot_residual,
@@ -31,6 +33,7 @@ from photutils_mgauss.plotting.motions import (
     plot_residual_vectors,
 )
 from photutils_mgauss.plotting.posterior import (
+    plot_corner,
     plot_model_graph,
     plot_posterior,
     plot_trace,
@@ -45,11 +48,13 @@ from photutils_mgauss.plotting.stars import (
 __all__ = [
     'plot_comparison',
     'plot_comparison_of_numbers',
+    'plot_corner',
     'plot_detections',
     'plot_ellipses',
     'plot_error_curve',
     'plot_errors_by_epochs',
     'plot_field',
+    'plot_mixture',
     'plot_model_graph',
     'plot_motion_errors',
     'plot_node_map',

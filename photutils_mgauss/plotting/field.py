@@ -1,18 +1,17 @@
-"""Figures of PSF fields, on the Axes they are given."""
+"""Figures of PSF fields."""
 import numpy as np
 
-from photutils_mgauss.plotting.style import VERMILION
+from photutils_mgauss.plotting.style import VERMILION, current_axes
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.validation import as_choice, as_integer
 
 
-def plot_field(ax, field, quantity='size', *, n=20):
+def plot_field(field, quantity='size', *, n=20, ax=None):
     """
     Draw how a PSF field varies over the detector, and its stars.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
     field : MixtureField or TunedMixtureField
     quantity : {'size', 'ellipticity', 'residual'}, optional
         A map of R^2; whiskers along the major axes, as long as the
@@ -20,11 +19,13 @@ def plot_field(ax, field, quantity='size', *, n=20):
         their flux, which shows what the Gaussians cannot describe.
     n : int, optional
         The number of places along the longer side of the detector.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
-    `~matplotlib.artist.Artist`
-        The map, whiskers or image, for a colour bar.
+    `~matplotlib.axes.Axes`
+        Its Axes; maps and images have a colour bar beside them.
 
     Examples
     --------
@@ -38,10 +39,11 @@ def plot_field(ax, field, quantity='size', *, n=20):
     >>> data = sum(psf.render((50, 55), x, y, flux=1000) for x, y in stars)
     >>> field = fit_mixture_field(data, stars, error=np.ones((50, 55)),
     ...                           n_components=1, degree=0)
-    >>> ax = Figure().add_subplot()
-    >>> plot_field(ax, field, n=5)
-    <matplotlib.collections.QuadMesh object at ...>
+    >>> ax = plot_field(field, n=5, ax=Figure().add_subplot())
+    >>> ax.get_title()
+    '$R^2$ [pix$^2$]'
     """
+    ax = current_axes(ax)
     quantity = as_choice(quantity, 'quantity',
                          ('size', 'ellipticity', 'residual'))
     if quantity == 'residual':
@@ -53,17 +55,18 @@ def plot_field(ax, field, quantity='size', *, n=20):
             for size in (nx, ny))
     shapes = adaptive_moments([field.mixture_at(a, b) for b in y for a in x])
     draw = _plot_sizes if quantity == 'size' else _plot_whiskers
-    artist = draw(ax, x, y, shapes)
+    draw(ax, x, y, shapes)
     _mark_stars(ax, field.stars)
     ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal',
            xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5))
-    return artist
+    return ax
 
 
 def _plot_sizes(ax, x, y, shapes):
     ax.set_title('$R^2$ [pix$^2$]')
-    return ax.pcolormesh(x, y, np.reshape(shapes.r2, (y.size, x.size)),
-                         shading='nearest', cmap='viridis')
+    shown = ax.pcolormesh(x, y, np.reshape(shapes.r2, (y.size, x.size)),
+                          shading='nearest', cmap='viridis')
+    ax.figure.colorbar(shown, ax=ax)
 
 
 def _plot_whiskers(ax, x, y, shapes):
@@ -71,9 +74,9 @@ def _plot_whiskers(ax, x, y, shapes):
     angle = 0.5 * np.arctan2(shapes.e2, shapes.e1)
     length = np.hypot(shapes.e1, shapes.e2)
     ax.set_title(f'ellipticity, at most {length.max():.3f}')
-    return ax.quiver(x, y, length * np.cos(angle), length * np.sin(angle),
-                     angles='xy', pivot='mid', headwidth=0, headlength=0,
-                     headaxislength=0)
+    ax.quiver(x, y, length * np.cos(angle), length * np.sin(angle),
+              angles='xy', pivot='mid', headwidth=0, headlength=0,
+              headaxislength=0)
 
 
 def _mark_stars(ax, stars):
@@ -98,5 +101,7 @@ def _plot_mean_residual(ax, field):
     limit = np.nanmax(np.abs(mean))
     ax.set(title='mean residual [flux / pix]', xlabel='x [pix]',
            ylabel='y [pix]')
-    return ax.imshow(mean, origin='lower', cmap='RdBu', vmin=-limit,
-                     vmax=limit, extent=[-half - 0.5, half + 0.5] * 2)
+    shown = ax.imshow(mean, origin='lower', cmap='RdBu', vmin=-limit,
+                      vmax=limit, extent=[-half - 0.5, half + 0.5] * 2)
+    ax.figure.colorbar(shown, ax=ax)
+    return ax

@@ -1,26 +1,31 @@
-"""Figures of a mixture and of the image it was fitted to, on given Axes."""
+"""Figures of a mixture and of the image it was fitted to."""
 import numpy as np
 
-from photutils_mgauss.plotting.style import BLACK, BLUE, CYCLE, VERMILION
+from photutils_mgauss.plotting.style import (
+    BLACK,
+    BLUE,
+    CYCLE,
+    VERMILION,
+    current_axes,
+)
 from photutils_mgauss.utils.image import read_quantity
 
 __all__ = [
     'plot_comparison_of_numbers',
     'plot_ellipses',
+    'plot_mixture',
     'plot_profile',
     'plot_projection',
     'plot_residual',
 ]
 
 
-def plot_projection(ax, fit, image, *, axis='x', oversampling=1):
+def plot_projection(fit, image, *, axis='x', oversampling=1, ax=None):
     """
     Plot an image, its fit and each Gaussian summed along one axis (Fig. 3a).
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     fit : MixtureFit
         The fit.
     image : (ny, nx) array_like or NDData
@@ -29,12 +34,14 @@ def plot_projection(ax, fit, image, *, axis='x', oversampling=1):
         The axis that stays.
     oversampling : int or (y, x) tuple of int, optional
         Image pixels per native pixel.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     image, _ = read_quantity(image, 'image')
     step = np.broadcast_to(oversampling, 2)[::-1][0 if axis == 'x' else 1]
     along = 0 if axis == 'x' else 1
@@ -61,7 +68,7 @@ def plot_projection(ax, fit, image, *, axis='x', oversampling=1):
     return ax
 
 
-def plot_profile(ax, fit, image):
+def plot_profile(fit, image, *, ax=None):
     """
     Plot the brightest row of image, model and residual in logarithms.
 
@@ -70,18 +77,18 @@ def plot_profile(ax, fit, image):
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     fit : MixtureFit
         The fit.
     image : (ny, nx) array_like or NDData
         The image that was fitted.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     image, _ = read_quantity(image, 'image')
     row, _ = np.unravel_index(np.nanargmax(np.where(fit.used, image, -np.inf)),
                               image.shape)
@@ -99,7 +106,7 @@ def plot_profile(ax, fit, image):
     return ax
 
 
-def plot_residual(ax, fit, *, peak, limit=None, label=None):
+def plot_residual(fit, *, peak=None, limit=None, label=None, ax=None):
     """
     Show the residual image of a fit, as a fraction of the image's peak.
 
@@ -108,52 +115,69 @@ def plot_residual(ax, fit, *, peak, limit=None, label=None):
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     fit : MixtureFit
         The fit.
-    peak : float
-        The peak of the image.
+    peak : float, optional
+        The peak of the image; None is the peak of the model.
     limit : float, optional
         The fraction at the ends of the colours; None is the largest residual.
         Give several panels the same.
     label : str, optional
         A title, such as the number of Gaussians and the time.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
-    `~matplotlib.image.AxesImage`
-        To make a colour bar from.
+    `~matplotlib.axes.Axes`
+        Its Axes, with a colour bar beside them.
     """
-    residual, peak = np.asarray(fit.residual), np.asarray(peak)
-    values = np.where(fit.used, residual, np.nan) / peak
+    ax = current_axes(ax)
+    shown = _draw_residual(ax, fit, peak, limit, label)
+    ax.figure.colorbar(shown, ax=ax, label='residual / peak')
+    return ax
+
+
+def _draw_residual(ax, fit, peak, limit, label):
+    """Draw a residual image and return it, without a colour bar."""
+    if peak is None:
+        peak = np.asarray(fit.flux) * fit.mixture.evaluate(
+            *fit.mixture.means.T).max()
+    values = np.where(fit.used, fit.residual, np.nan) / np.asarray(peak)
     limit = np.nanmax(np.abs(values)) if limit is None else limit
-    shown = ax.imshow(values, origin='lower', cmap='RdBu_r', vmin=-limit,
-                      vmax=limit)
     ax.set(xticks=[], yticks=[])
     ax.set_title(label or f'K = {fit.mixture.n_components}')
-    return shown
+    return ax.imshow(values, origin='lower', cmap='RdBu_r', vmin=-limit,
+                     vmax=limit)
 
 
-def plot_comparison_of_numbers(axes, image, table):
+def plot_comparison_of_numbers(image, table, *, axes=None):
     """
     Show image and residuals for several numbers of Gaussians (Appendix B).
 
     Parameters
     ----------
-    axes : sequence of `~matplotlib.axes.Axes`
-        One more than the table has rows.
     image : (ny, nx) array_like or NDData
         The image.
     table : `~astropy.table.QTable`
         From `~photutils_mgauss.compare_n_components`.
+    axes : sequence of `~matplotlib.axes.Axes`, optional
+        One more than the table has rows; None makes a figure for them.
 
     Returns
     -------
-    sequence of `~matplotlib.axes.Axes`
-        The same.
+    `~numpy.ndarray` of `~matplotlib.axes.Axes`
+
+    Raises
+    ------
+    ValueError
+        If there are more or fewer Axes than that.
     """
     image, _ = read_quantity(image, 'image')
+    if axes is None:
+        import matplotlib.pyplot as plt
+        n = len(table) + 1
+        axes = plt.subplots(1, n, figsize=(2.4 * n, 2.6))[1]
     axes = np.ravel(axes)
     if len(axes) != len(table) + 1:
         msg = (f'axes must be one more than the {len(table)} rows of the '
@@ -163,30 +187,70 @@ def plot_comparison_of_numbers(axes, image, table):
     axes[0].set(xticks=[], yticks=[], title='image')
     limit = max(table['max_residual'])
     for ax, row, fit in zip(axes[1:], table, table.meta['fits'], strict=True):
-        plot_residual(ax, fit, peak=np.nanmax(image), limit=limit,
-                      label=f"K = {row['n_components']}, "
-                            f"{1e3 * row['time']:.1f} ms")
+        shown = _draw_residual(ax, fit, np.nanmax(image), limit,
+                               f"K = {row['n_components']}, largest "
+                               f"{row['max_residual']:.1%}")
+    axes[0].figure.colorbar(shown, ax=list(axes), label='residual / peak')
     return axes
 
 
-def plot_ellipses(ax, mixture, *, n_sigma=1):
+def plot_mixture(mixture, *, radius=None, decades=4, pixel_integrated=False,
+                 ax=None):
+    """
+    Show a mixture on a logarithmic scale.
+
+    Parameters
+    ----------
+    mixture : GaussianMixture
+        The mixture.
+    radius : float, optional
+        Half the width of the image [pix]; None is four times the root of the
+        mean variance of the light.
+    decades : float, optional
+        How many powers of ten below the peak are shown.
+    pixel_integrated : bool, optional
+        Whether to integrate the mixture over pixels.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        Its Axes, with a colour bar beside them.
+    """
+    ax = current_axes(ax)
+    if radius is None:
+        radius = 4 * np.sqrt(max(np.trace(mixture.moments().covariance), 0.5)
+                             / 2)
+    points = np.linspace(-radius, radius, 161)
+    image = mixture.evaluate(points, points[:, None],
+                             pixel_integrated=pixel_integrated)
+    shown = ax.imshow(
+        np.log10(np.maximum(image / image.max(), 10.0 ** -decades)),
+        origin='lower', cmap='cividis', extent=(-radius, radius) * 2)
+    ax.figure.colorbar(shown, ax=ax, label='log of value / peak')
+    ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal')
+    return ax
+
+
+def plot_ellipses(mixture, *, n_sigma=1, ax=None):
     """
     Draw the contour of each Gaussian of a mixture.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     mixture : GaussianMixture
         The mixture.
     n_sigma : float, optional
         How many standard deviations out.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     angle = np.linspace(0, 2 * np.pi, 100)
     circle = np.array([np.cos(angle), np.sin(angle)])
     for k in range(mixture.n_components):

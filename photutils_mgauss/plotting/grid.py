@@ -1,8 +1,9 @@
-"""Figures of a PSF over a detector, on the Axes they are given."""
+"""Figures of a PSF over a detector."""
 import numpy as np
 from astropy.stats import mad_std
 
-from photutils_mgauss.plotting.style import BLACK, BLUE, ORANGE
+from photutils_mgauss.plotting.fit import plot_mixture
+from photutils_mgauss.plotting.style import BLACK, BLUE, ORANGE, current_axes
 from photutils_mgauss.psf.shapes import adaptive_moments
 
 __all__ = [
@@ -22,14 +23,12 @@ _NODE_LABELS = {
 }
 
 
-def plot_node_map(ax, psf, column='size_error', *, layout=None):
+def plot_node_map(psf, column='size_error', *, layout=None, ax=None):
     r"""
     Map a column of the nodes' report (as Figs. 4-7 of Nie et al.).
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     psf : GriddedMixturePSF or a dict of them
         One detector, or several by name.
     column : str, optional
@@ -39,11 +38,13 @@ def plot_node_map(ax, psf, column='size_error', *, layout=None):
     layout : dict of (x, y), optional
         Where the pixel (0, 0) of each detector is in the focal plane [pix];
         by default the detectors stand side by side.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same; its title tells median and scatter
+        Its Axes; its title tells median and scatter
         (`~astropy.stats.mad_std`) of the nodes that are not bridged.
 
     Raises
@@ -51,6 +52,7 @@ def plot_node_map(ax, psf, column='size_error', *, layout=None):
     ValueError
         If ``layout`` has no place for a detector.
     """
+    ax = current_axes(ax)
     psfs, places = _laid_out(psf, layout)
     reports = {name: one.report for name, one in psfs.items()}
     values = np.concatenate([np.where(report['bridged'], np.nan,
@@ -71,14 +73,12 @@ def plot_node_map(ax, psf, column='size_error', *, layout=None):
     return _focal_plane(ax, psfs, places)
 
 
-def plot_whiskers(ax, psf, *, layout=None, scale=None):
+def plot_whiskers(psf, *, layout=None, scale=None, ax=None):
     """
     Plot the ellipticity of the nodes as whiskers along the long axis.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     psf : GriddedMixturePSF or a dict of them
         One detector, or several by name.
     layout : dict of (x, y), optional
@@ -86,12 +86,14 @@ def plot_whiskers(ax, psf, *, layout=None, scale=None):
     scale : float, optional
         The length of a whisker of ellipticity 1 [pix]; by default the largest
         whisker is as long as half the distance of two nodes.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     psfs, places = _laid_out(psf, layout)
     segments = []
     for name, one in psfs.items():
@@ -111,26 +113,27 @@ def plot_whiskers(ax, psf, *, layout=None, scale=None):
     return _focal_plane(ax, psfs, places)
 
 
-def plot_worst_node(ax, psf, source, column='size_error'):
+def plot_worst_node(psf, source, column='size_error', *, ax=None):
     """
     Show the residual of the node with the largest error.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     psf : GriddedMixturePSF
         The grid of mixtures.
     source : `~photutils.psf.GriddedPSFModel`
         The ePSFs it was made of.
     column : str, optional
         The column of ``report`` that is the error.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
         The same, with ePSF minus mixture in per cent of the ePSF's peak.
     """
+    ax = current_axes(ax)
     report = psf.report
     error = np.where(report['bridged'], 0, np.abs(report[column]))
     worst = int(np.nanargmax(error))
@@ -153,25 +156,25 @@ def plot_worst_node(ax, psf, source, column='size_error'):
     return ax
 
 
-def plot_width_map(ax, psf, *, stars=None):
+def plot_width_map(psf, *, stars=None, ax=None):
     r"""
     Map the width of the nodes' PSFs, :math:`2.35 \sqrt{R^2 / 2}`.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     psf : GriddedMixturePSF
         The PSF.
     stars : (n, 2) array_like, optional
         Positions of the stars it was made of, to be marked [pix].
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
-    fwhm = 2.3548 * np.sqrt(adaptive_moments(psf.mixtures).r2 / 2)
+    ax = current_axes(ax)
+    fwhm = np.atleast_1d(adaptive_moments(psf.mixtures).fwhm)
     x, y = psf.grid_xypos.T
     points = ax.scatter(x, y, c=fwhm, s=12, marker='s', cmap='cividis')
     ax.figure.colorbar(points, ax=ax, label='FWHM [pix]')
@@ -183,14 +186,12 @@ def plot_width_map(ax, psf, *, stars=None):
     return _focal_plane(ax, {'': psf}, {'': (0, 0)})
 
 
-def plot_psf_image(ax, psf, x, y, *, radius=8, decades=4):
+def plot_psf_image(psf, x, y, *, radius=8, decades=4, ax=None):
     """
     Show the PSF at a place, in logarithms.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     psf : GriddedMixturePSF
         The PSF.
     x, y : float
@@ -199,26 +200,20 @@ def plot_psf_image(ax, psf, x, y, *, radius=8, decades=4):
         Half the width of the image [pix].
     decades : float, optional
         How many powers of ten below the peak are shown.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
-    points = np.linspace(-radius, radius, 161)
-    image = psf.mixture_at(x, y).evaluate(
-        points, points[:, None], pixel_integrated=psf.pixel_integrated)
-    peak = image.max()
-    shown = ax.imshow(
-        np.log10(np.maximum(image / peak, 10.0 ** -decades)), origin='lower',
-        cmap='cividis', extent=(-radius, radius, -radius, radius))
-    ax.figure.colorbar(shown, ax=ax, label='log of value / peak')
-    ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal',
-           title=f'the PSF at ({x:.0f}, {y:.0f})')
+    ax = plot_mixture(psf.mixture_at(x, y), radius=radius, decades=decades,
+                      pixel_integrated=psf.pixel_integrated, ax=ax)
+    ax.set_title(f'the PSF at ({x:.0f}, {y:.0f})')
     return ax
 
 
-def plot_shape_map(ax, x, y, values, *, label):
+def plot_shape_map(x, y, values, *, label, ax=None):
     """
     Show a quantity at points of the detector, its mean and scatter on top.
 
@@ -228,20 +223,21 @@ def plot_shape_map(ax, x, y, values, *, label):
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     x, y : (n,) array_like
         Positions on the detector [pix].
     values : (n,) array_like
         The deviations; NaN is left out.
     label : str
         What they are.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
-    `~matplotlib.collections.PathCollection`
-        To make a colour bar from.
+    `~matplotlib.axes.Axes`
+        Its Axes, with a colour bar beside them.
     """
+    ax = current_axes(ax)
     values = np.asarray(values, float)
     limit = np.nanmax(np.abs(values))
     shown = ax.scatter(x, y, c=values, cmap='RdBu_r', vmin=-limit, vmax=limit,
@@ -249,7 +245,8 @@ def plot_shape_map(ax, x, y, values, *, label):
     ax.set(aspect='equal', xlabel='x [pix]', ylabel='y [pix]')
     ax.set_title(f'{label}: {np.nanmean(values):+.2e} '
                  f'$\\pm$ {np.nanstd(values):.1e}')
-    return shown
+    ax.figure.colorbar(shown, ax=ax, label=label)
+    return ax
 
 
 def _laid_out(psf, layout):

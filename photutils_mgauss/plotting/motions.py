@@ -1,7 +1,7 @@
-"""Figures of epochs and proper motions, on the Axes they are given."""
+"""Figures of epochs and proper motions."""
 import numpy as np
 
-from photutils_mgauss.plotting.style import BLUE, ORANGE
+from photutils_mgauss.plotting.style import BLUE, ORANGE, current_axes
 
 __all__ = [
     'plot_errors_by_epochs',
@@ -11,14 +11,12 @@ __all__ = [
 ]
 
 
-def plot_residual_vectors(ax, solution, epoch, *, scale=None):
+def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     """
     Draw the residuals of one epoch's references and stars as arrows.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     solution : `~photutils_mgauss.MotionSolution`
         Whose residuals.
     epoch : int
@@ -26,12 +24,15 @@ def plot_residual_vectors(ax, solution, epoch, *, scale=None):
     scale : float, optional
         Residual [mas] as long as a tenth of the field; the default is three
         times the median residual.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same; rejected detections are orange.
+        Its Axes; rejected detections are orange.
     """
+    ax = current_axes(ax)
     rows = solution.residuals[solution.residuals['epoch'] == epoch]
     x, y = _field_coordinates(rows)
     u, v = rows['dra'].value, rows['ddec'].value
@@ -64,22 +65,23 @@ def _field_coordinates(rows):
             3600 * (dec - middle))
 
 
-def plot_proper_motions(ax, stars):
+def plot_proper_motions(stars, *, ax=None):
     """
     Plot the proper-motion diagram of a table of stars.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     stars : `~astropy.table.QTable`
         As `~photutils_mgauss.MotionSolution.stars`.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same; reference objects are orange.
+        Its Axes; reference objects are orange.
     """
+    ax = current_axes(ax)
     reference = _is_reference(stars)
     for which, colour, label in ((~reference, BLUE, 'stars'),
                                  (reference, ORANGE, 'references')):
@@ -101,23 +103,26 @@ def _is_reference(stars):
     return np.ma.filled(stars['reference'], '') != ''
 
 
-def plot_motion_errors(ax, stars, magnitude):
+def plot_motion_errors(stars, magnitude, *, ax=None):
     """
     Plot errors of motions against magnitude (as Fig. 12 of Nie et al.).
 
     Parameters
     ----------
-    ax, stars : `~matplotlib.axes.Axes`, `~astropy.table.QTable`
+    stars : `~astropy.table.QTable`
         As for `plot_proper_motions`.
     magnitude : (n,) array_like
         A magnitude for each.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same. Reference objects, whose errors a catalogue gave, are left
+        Its Axes. Reference objects, whose errors a catalogue gave, are left
         out.
     """
+    ax = current_axes(ax)
     free = ~_is_reference(stars)
     for name, colour in (('pmra', ORANGE), ('pmdec', BLUE)):
         ax.plot(np.asarray(magnitude)[free],
@@ -129,23 +134,23 @@ def plot_motion_errors(ax, stars, magnitude):
     return ax
 
 
-def plot_errors_by_epochs(ax, solutions):
+def plot_errors_by_epochs(solutions, *, ax=None):
     """
     Plot the median error of motions against the number of epochs.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     solutions : sequence of `~photutils_mgauss.MotionSolution`
         Fits to different numbers of epochs (as Fig. 11 of Nie et al.).
         Their reference objects do not count.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     counts = [len(solution.epochs) for solution in solutions]
     measured = [solution.stars[~_is_reference(solution.stars)]
                 for solution in solutions]

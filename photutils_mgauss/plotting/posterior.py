@@ -1,35 +1,44 @@
-"""Figures of the Bayesian fit, on the Axes they are given."""
+"""Figures of the Bayesian fit."""
 import numpy as np
 
-from photutils_mgauss.plotting.style import CYCLE
+from photutils_mgauss.plotting.style import BLUE, CYCLE, current_axes
 
 __all__ = [
+    'plot_corner',
     'plot_model_graph',
     'plot_posterior',
     'plot_trace',
 ]
 
+# What `plot_posterior` and its like can be asked for, and its parameters.
+_QUANTITIES = {
+    'weights': ('weight_',), 'means': ('x_mean_', 'y_mean_'),
+    'stddevs': ('x_stddev_', 'y_stddev_'), 'rho': ('rho_',),
+    'flux': ('flux',), 'sigma': ('sigma',)}
 
-def plot_posterior(ax, posterior, name):
+
+def plot_posterior(posterior, name, *, ax=None):
     """
     Plot the histogram of one quantity's draws (Appendix A, left).
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     posterior : MixturePosterior
         The draws.
     name : str
-        ``'omega'``, ``'alpha'``, ``'beta'``, ``'gamma'``, ``'flux'`` or
-        ``'sigma'``; every number in it has a curve.
+        ``'weights'``, ``'means'``, ``'stddevs'``, ``'rho'``, ``'flux'`` or
+        ``'sigma'``, every number of which has a curve; or one parameter, such
+        as ``'x_stddev_1'``.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
-    for i, (label, draws) in enumerate(_named_draws(posterior, name)):
+    chosen = _named_draws(posterior, name)
+    ax = current_axes(ax)
+    for i, (label, draws) in enumerate(chosen):
         density, edges = np.histogram(draws, bins=40, density=True)
         ax.stairs(density, edges, color=CYCLE[i % len(CYCLE)], label=label)
     ax.set(xlabel=_with_unit(name), ylabel='density')
@@ -37,25 +46,26 @@ def plot_posterior(ax, posterior, name):
     return ax
 
 
-def plot_trace(ax, posterior, name):
+def plot_trace(posterior, name, *, ax=None):
     """
     Plot the draws of one quantity one after the other (Appendix A, right).
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     posterior : MixturePosterior
         The draws.
     name : str
         See `plot_posterior`. Chains are drawn over each other.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
-    for i, (label, draws) in enumerate(_named_draws(posterior, name)):
+    chosen = _named_draws(posterior, name)
+    ax = current_axes(ax)
+    for i, (label, draws) in enumerate(chosen):
         for c, chain in enumerate(draws):
             ax.plot(chain, color=CYCLE[i % len(CYCLE)], linewidth=0.4,
                     alpha=0.7, label=label if c == 0 else None)
@@ -64,41 +74,111 @@ def plot_trace(ax, posterior, name):
     return ax
 
 
+def plot_corner(posterior, names=None, *, axes=None):
+    """
+    Plot histograms of parameters and the draws of each pair of them.
+
+    Parameters
+    ----------
+    posterior : MixturePosterior
+        The draws.
+    names : sequence of str, optional
+        Parameters or quantities as in `plot_posterior`; None is all
+        parameters that vary.
+    axes : (n, n) array_like of `~matplotlib.axes.Axes`, optional
+        Where to draw n parameters; None makes a figure for them.
+
+    Returns
+    -------
+    (n, n) `~numpy.ndarray` of `~matplotlib.axes.Axes`
+        Those above the diagonal are empty.
+
+    Raises
+    ------
+    ValueError
+        If a name is unknown, or ``axes`` has another shape.
+    """
+    names = list(posterior.parameters()) if names is None else list(names)
+    draws = {label: np.ravel(values) for name in names
+             for label, values in _named_draws(posterior, name)
+             if np.ptp(values) > 0}
+    axes = _square_of_axes(axes, len(draws))
+    for i, (y_name, y) in enumerate(draws.items()):
+        for j, (x_name, x) in enumerate(draws.items()):
+            ax = axes[i, j]
+            if j > i:
+                ax.set_axis_off()
+                continue
+            if i == j:
+                ax.stairs(*np.histogram(x, bins=30), color=BLUE)
+                ax.set(yticks=[])
+            else:
+                ax.plot(x, y, ',', color=BLUE, alpha=0.4, rasterized=True)
+            ax.locator_params(nbins=3)
+            ax.label_outer()
+            if i == len(draws) - 1:
+                ax.set_xlabel(_with_unit(x_name))
+            if j == 0 < i:
+                ax.set_ylabel(_with_unit(y_name))
+    return axes
+
+
+def _square_of_axes(axes, n):
+    """Return (n, n) Axes, those given or new ones."""
+    if axes is None:
+        import matplotlib.pyplot as plt
+        size = max(4, 1.3 * n)
+        axes = plt.subplots(n, n, figsize=(size, size), squeeze=False,
+                            sharex='col', layout='constrained')[1]
+    axes = np.atleast_2d(axes)
+    if axes.shape != (n, n):
+        msg = (f'axes must have the shape ({n}, {n}), one row for each '
+               f'parameter that varies, got {axes.shape}')
+        raise ValueError(msg)
+    return axes
+
+
 def _with_unit(name):
-    """Return a label of the posterior's quantity: lengths are in pixels."""
-    return f'{name} [pix]' if name in ('alpha', 'beta') else name
+    """Return a label of a quantity or parameter: lengths are in pixels."""
+    lengths = 'means', 'stddevs', 'x_mean', 'y_mean', 'x_stddev', 'y_stddev'
+    return f'{name} [pix]' if name.startswith(lengths) else name
 
 
 def _named_draws(posterior, name):
     """Return (label, draws) of all parameters that a name covers."""
+    starts = _QUANTITIES.get(name, ())
     chosen = [(label, draws) for label, draws in
               posterior.parameters().items()
-              if label == name or label.startswith(f'{name}_')]
+              if label == name or label.startswith(tuple(starts))]
     if not chosen:
-        msg = ("name must be one of 'omega', 'alpha', 'beta', 'gamma', "
-               f"'flux', 'sigma', got {name!r}")
+        words = ', '.join(map(repr, _QUANTITIES))
+        msg = (f'name must be one of {words}, or a parameter such as '
+               f"'x_mean_1', got {name!r}")
         raise ValueError(msg)
     return chosen
 
 
-def plot_model_graph(ax, n_components, shape):
+def plot_model_graph(n_components, shape, *, ax=None):
     """
     Draw the graph of the Bayesian model (Fig. 2).
 
+    The symbols are the paper's: omega the weights, alpha the means, beta the
+    standard deviations, gamma the correlations.
+
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     n_components : int
         The number K of Gaussians.
     shape : (ny, nx) tuple of int
         The shape of the image.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     k = n_components
     nodes = {'sigma': ('HalfNormal', '1'), 'omega': ('Dirichlet', f'{k}'),
              'alpha': ('Normal', f'{k} x 2'),

@@ -1,8 +1,14 @@
-"""Figures of measured stars, on the Axes they are given."""
+"""Figures of measured stars."""
 import numpy as np
 from astropy.stats import mad_std
 
-from photutils_mgauss.plotting.style import BLACK, BLUE, CYCLE, ORANGE
+from photutils_mgauss.plotting.style import (
+    BLACK,
+    BLUE,
+    CYCLE,
+    ORANGE,
+    current_axes,
+)
 
 __all__ = [
     'plot_comparison',
@@ -12,22 +18,22 @@ __all__ = [
 ]
 
 
-def plot_detections(ax, x, y, flux):
+def plot_detections(x, y, flux, *, ax=None):
     """
     Map the stars of a catalogue, brighter ones larger.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     x, y, flux : (n,) array_like
         Positions [pix] and fluxes.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     flux = np.maximum(np.nan_to_num(flux), 1e-300)
     size = np.clip(np.log10(flux / np.percentile(flux, 5)), 0.1, 3)
     ax.scatter(x, y, s=4 * size**2, color=BLACK, linewidths=0, alpha=0.7)
@@ -36,14 +42,12 @@ def plot_detections(ax, x, y, flux):
     return ax
 
 
-def plot_stated_errors(ax, magnitude, errors, *, unit, label=None):
+def plot_stated_errors(magnitude, errors, *, unit, label=None, ax=None):
     """
     Plot the stated errors of stars against their magnitudes.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     magnitude : (n,) array_like
         Magnitudes [mag].
     errors : dict of (n,) array_like
@@ -52,12 +56,14 @@ def plot_stated_errors(ax, magnitude, errors, *, unit, label=None):
         Their unit.
     label : str, optional
         What the magnitudes are.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     for (name, values), colour in zip(errors.items(), CYCLE, strict=False):
         ax.plot(magnitude, values, '.', color=colour, markersize=3,
                 label=name)
@@ -67,14 +73,12 @@ def plot_stated_errors(ax, magnitude, errors, *, unit, label=None):
     return ax
 
 
-def plot_error_curve(ax, magnitude, residuals, errors, *, unit, n_bins=6):
+def plot_error_curve(magnitude, residuals, errors, *, unit, n_bins=6, ax=None):
     """
     Plot errors against magnitude (as Figs. 9-10 of Nie et al.).
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     magnitude : (n,) array_like
         Magnitudes [mag].
     residuals, errors : (n,) or (n, 2) array_like
@@ -83,12 +87,14 @@ def plot_error_curve(ax, magnitude, residuals, errors, *, unit, n_bins=6):
         Their unit, for the label.
     n_bins : int, optional
         The number of magnitude bins.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     magnitude = np.asarray(magnitude, float)
     residuals = np.reshape(residuals, (len(magnitude), -1))
     errors = np.reshape(errors, (len(magnitude), -1))
@@ -108,24 +114,24 @@ def plot_error_curve(ax, magnitude, residuals, errors, *, unit, n_bins=6):
     return ax
 
 
-def plot_comparison(ax, true, measured, errors, *, label, unit):
+def plot_comparison(true, measured, errors, *, label, unit, ax=None):
     """
     Plot measured values against true ones, with error bars.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     true, measured, errors : (n,) array_like
         Values and standard errors.
     label, unit : str
         What they are, for the labels.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same.
     """
+    ax = current_axes(ax)
     ax.errorbar(true, measured, errors, fmt='.', color=BLUE, ecolor=BLUE,
                 alpha=0.5, elinewidth=0.7)
     limits = np.nanmin(true), np.nanmax(true)

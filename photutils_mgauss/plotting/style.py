@@ -1,10 +1,18 @@
 """
-The colours of all figures.
+The colours of all figures, and the Axes they are drawn on.
 
-Those of Okabe and Ito, which the colour-blind can tell apart.
+The colours are those of Okabe and Ito, which the colour-blind can tell apart.
 """
 
-__all__ = ['BLACK', 'BLUE', 'CYCLE', 'ORANGE', 'VERMILION']
+__all__ = ['BLACK', 'BLUE', 'CYCLE', 'ORANGE', 'VERMILION', 'current_axes']
 
 BLACK, BLUE, ORANGE, VERMILION = '#000000', '#0072B2', '#E69F00', '#D55E00'
 CYCLE = (BLUE, ORANGE, '#009E73', '#CC79A7', VERMILION, '#56B4E9', '#F0E442')
+
+
+def current_axes(ax):
+    """Return the Axes given, or pyplot's current ones for None."""
+    if ax is not None:
+        return ax
+    import matplotlib.pyplot as plt
+    return plt.gca()

@@ -16,7 +16,7 @@ __getattr__, __dir__, __all__ = hand_on(__name__, {
     'assess_psf': 'assessment',
     'PSFAssessment': 'assessment',
     'GriddedMixturePSF': 'gridded',
-    'blend': 'mixture',
+    'blend': 'blending',
     'GaussianMixture': 'mixture',
     'MultiGaussianPSFModel': 'model',
     'adaptive_moments': 'shapes',

@@ -29,6 +29,7 @@ from photutils_mgauss.psf.errors import PSFErrors
 from photutils_mgauss.psf.grid import checked_arrays, make_grid, plain_report
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.model import MultiGaussianPSFModel
+from photutils_mgauss.utils.notebook import with_picture
 from photutils_mgauss.utils.validation import (
     as_choice,
     as_columns,
@@ -235,6 +236,44 @@ n_components=1)>
 
     def __repr__(self):
         return self._described(f'grid_shape={self.grid_shape}, ')
+
+    def _repr_html_(self):
+        return with_picture(repr(self), lambda ax: self.plot(ax=ax))
+
+    def plot(self, quantity='size', *, ax=None):
+        """
+        Draw the nodes over the detector.
+
+        Parameters
+        ----------
+        quantity : str, optional
+            ``'size'`` maps their widths, ``'ellipticity'`` draws whiskers,
+            and the name of a column of ``report`` maps that; see
+            `~photutils_mgauss.plotting.plot_width_map`,
+            `~photutils_mgauss.plotting.plot_whiskers` and
+            `~photutils_mgauss.plotting.plot_node_map`.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw; None is pyplot's current Axes.
+
+        Returns
+        -------
+        `~matplotlib.axes.Axes`
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there is no such quantity.
+        """
+        from photutils_mgauss import plotting
+        numbers = [name for name in self.report.colnames
+                   if self.report[name].dtype.kind in 'fiu']
+        quantity = as_choice(quantity, 'quantity',
+                             ('size', 'ellipticity', *numbers))
+        if quantity == 'size':
+            return plotting.plot_width_map(self, ax=ax)
+        if quantity == 'ellipticity':
+            return plotting.plot_whiskers(self, ax=ax)
+        return plotting.plot_node_map(self, quantity, ax=ax)
 
     def evaluate(self, x, y, flux, x_0, y_0):
         """

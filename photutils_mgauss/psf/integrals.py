@@ -1,5 +1,6 @@
-"""Integrals of mixtures over discs."""
+"""Integrals of mixtures over discs, and the width at half of the peak."""
 import numpy as np
+from scipy.optimize import minimize
 from scipy.special import erf
 
 
@@ -27,3 +28,22 @@ def polar_integral(mixture, radius, n_angles):
                   * (erf(root * (r - h)) + erf(root * h)))
         total += height * peak * inside
     return total.mean(axis=1) * 2 * np.pi
+
+
+def half_maximum_width(mixture):
+    """Return the diameter of the contour at half of the peak [pix]."""
+    heights = mixture.evaluate(*mixture.means.T)
+    peak = minimize(lambda r: -mixture.evaluate(*r) / heights.max(),
+                    mixture.means[heights.argmax()],
+                    jac=lambda r: -mixture.gradient(*r) / heights.max()).x
+    half = mixture.evaluate(*peak) / 2
+    angle = np.linspace(0, 2 * np.pi, 128, endpoint=False)
+    low = np.zeros(angle.size)
+    high = np.full(angle.size, 10 * mixture.stddevs.max())
+    for _ in range(50):
+        radius = (low + high) / 2
+        inside = mixture.evaluate(peak[0] + radius * np.cos(angle),
+                                  peak[1] + radius * np.sin(angle)) > half
+        low = np.where(inside, radius, low)
+        high = np.where(inside, high, radius)
+    return float(2 * np.sqrt(np.mean(radius**2)))

@@ -13,9 +13,10 @@ import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.files.storage import storable
-from photutils_mgauss.psf.integrals import polar_integral
+from photutils_mgauss.psf.integrals import half_maximum_width, polar_integral
 from photutils_mgauss.psf.rows import kernel_rows, matrices
 from photutils_mgauss.utils.equality import ComparedByValue
+from photutils_mgauss.utils.notebook import with_picture
 from photutils_mgauss.utils.validation import (
     as_floats,
     as_real,
@@ -24,7 +25,7 @@ from photutils_mgauss.utils.validation import (
     real_array,
 )
 
-__all__ = ['GaussianMixture', 'Moments', 'blend']
+__all__ = ['GaussianMixture', 'Moments']
 
 
 class Moments(NamedTuple):
@@ -108,6 +109,31 @@ class GaussianMixture(ComparedByValue):
         return (f'<GaussianMixture of {self.n_components}, weights '
                 f'{np.array2string(self.weights, precision=3)}>')
 
+    def _repr_html_(self):
+        return with_picture(repr(self), lambda ax: self.plot(ax=ax))
+
+    def plot(self, *, radius=None, pixel_integrated=False, ax=None):
+        """
+        Show the mixture on a logarithmic scale of four decades.
+
+        Parameters
+        ----------
+        radius : float, optional
+            Half the width of the image [pix]; None follows the size of the
+            mixture.
+        pixel_integrated : bool, optional
+            Whether to integrate the mixture over pixels.
+        ax : `~matplotlib.axes.Axes`, optional
+            Where to draw; None is pyplot's current Axes.
+
+        Returns
+        -------
+        `~matplotlib.axes.Axes`
+        """
+        from photutils_mgauss.plotting import plot_mixture
+        return plot_mixture(self, radius=radius, ax=ax,
+                            pixel_integrated=pixel_integrated)
+
     def _to_tables(self):
         return {'components': {'weight': self.weights, 'mean': self.means,
                                'covariance': self.covariances}}
@@ -183,6 +209,16 @@ class GaussianMixture(ComparedByValue):
     def rho(self):
         """The correlation coefficients, (K,)."""
         return self.covariances[:, 0, 1] / self.stddevs.prod(axis=1)
+
+    @cached_property
+    def fwhm(self):
+        """
+        The full width at half maximum [pix], sampled, not integrated.
+
+        The diameter of the circle with the area inside the contour at half of
+        the peak.
+        """
+        return half_maximum_width(self)
 
     @cached_property
     def rows(self):
@@ -499,50 +535,6 @@ class GaussianMixture(ComparedByValue):
         offset = as_floats(offset, 'offset', shape=(2,))
         return GaussianMixture(self.weights, self.means + offset,
                                self.covariances)
-
-
-def blend(mixtures, fractions):
-    """
-    Mix M mixtures into one (Sec. 3.3: 4 neighbours of 3 make 12 Gaussians).
-
-    Parameters
-    ----------
-    mixtures : sequence of M GaussianMixture
-        The mixtures; their numbers of Gaussians may differ.
-    fractions : (M,) array_like
-        The share of each; they sum to 1.
-
-    Returns
-    -------
-    GaussianMixture
-        The image of the blend is the weighted sum of the images.
-
-    Raises
-    ------
-    ValueError
-        If the numbers of mixtures and fractions differ, or the fractions do
-        not sum to 1.
-
-    Examples
-    --------
-    >>> from photutils_mgauss import GaussianMixture, blend
-    >>> narrow = GaussianMixture([1], [[0, 0]], [[[1, 0], [0, 1]]])
-    >>> wide = GaussianMixture([1], [[0, 0]], [[[4, 0], [0, 4]]])
-    >>> blend([narrow, wide], [0.75, 0.25]).weights
-    array([0.75, 0.25])
-    """
-    mixtures = list(mixtures)
-    for mixture in mixtures:
-        if not isinstance(mixture, GaussianMixture):
-            msg = f'mixtures must be GaussianMixtures, got {mixture!r:.80}'
-            raise TypeError(msg)
-    fractions = as_floats(fractions, 'fractions', shape=(len(mixtures),))
-    # Only weights change: averaging shapes would pair components whose order
-    # is arbitrary.
-    weights = [f * m.weights for f, m in zip(fractions, mixtures, strict=True)]
-    return GaussianMixture(np.concatenate(weights),
-                           np.concatenate([m.means for m in mixtures]),
-                           np.concatenate([m.covariances for m in mixtures]))
 
 
 def _points(x, y):

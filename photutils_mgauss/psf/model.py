@@ -200,7 +200,7 @@ class MultiGaussianPSFModel(PSFModel):
 
     def free_shape(self):
         """
-        Free all shape parameters but the mean of the first Gaussian.
+        Return a copy whose shape is free, but for the first Gaussian's mean.
 
         That mean stays fixed because a common shift of all means cannot be
         told from ``x_0`` and ``y_0``: fits of both run away.
@@ -208,7 +208,6 @@ class MultiGaussianPSFModel(PSFModel):
         Returns
         -------
         MultiGaussianPSFModel
-            The model itself, changed in place.
 
         Examples
         --------
@@ -217,9 +216,10 @@ class MultiGaussianPSFModel(PSFModel):
         >>> [name for name, fixed in model.fixed.items() if not fixed]
         ['flux', 'x_0', 'y_0', 'x_stddev_1', 'y_stddev_1', 'rho_1']
         """
+        free = self.copy()
         for name in self.param_names[3:]:
-            getattr(self, name).fixed = name in ('x_mean_1', 'y_mean_1')
-        return self
+            getattr(free, name).fixed = name in ('x_mean_1', 'y_mean_1')
+        return free
 
     def convolve(self, kernel):
         """

@@ -12,6 +12,7 @@ from enum import IntEnum
 from functools import partial
 
 import numpy as np
+from astropy.stats import gaussian_sigma_to_fwhm
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.mixture import GaussianMixture
@@ -120,6 +121,11 @@ class Shapes(ComparedByValue):
     def ellipticity(self):
         """The total ellipticity, the root of e1^2 + e2^2 (Eq. 6)."""
         return (self.e1**2 + self.e2**2) ** 0.5
+
+    @property
+    def fwhm(self):
+        """The full width at half maximum of the matching Gaussian [pix]."""
+        return gaussian_sigma_to_fwhm * (self.r2 / 2) ** 0.5
 
     @property
     def message(self):

@@ -1,6 +1,9 @@
 """Names that a package hands on and loads when they are first used."""
 from importlib import import_module
 
+from astropy.io import registry
+from astropy.table import Table
+
 
 def hand_on(package, owners):
     """
@@ -32,3 +35,24 @@ def hand_on(package, owners):
         return sorted({*vars(import_module(package)), *owners})
 
     return load, listing, list(owners)
+
+
+def offer_formats(names, owner, reader):
+    """
+    Let `astropy.table.Table.read` know of formats, read by a module later.
+
+    Parameters
+    ----------
+    names : sequence of str
+        What the formats are called after ``'mgauss.'``.
+    owner, reader : str
+        The module, and in it the function of a file, a name and options.
+    """
+    def later(name):
+        def read(file, **options):
+            return getattr(import_module(owner), reader)(file, name,
+                                                         **options)
+        return read
+    for name in names:
+        registry.register_reader(f'mgauss.{name}', Table, later(name),
+                                 force=True)

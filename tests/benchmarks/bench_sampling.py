@@ -138,15 +138,15 @@ def main():
         image, arguments.k, prior='paper', pixel_scale=PIXEL_SCALE,
         oversampling=2, draws=arguments.draws, tune=arguments.tune,
         chains=arguments.chains, cores=arguments.cores,
-        sampler=arguments.sampler, random_seed=arguments.seed)
+        sampler=arguments.sampler, rng=arguments.seed)
     middle = clock()
     own = [getattr(ours, name) for name in NAMES]
     describe(f'sample_mixture ({arguments.sampler})', middle - before, own)
     fit = ours.fit
     errors = np.sqrt(np.diag(fit.covariance)).reshape(-1, 6)
     widths = np.column_stack([
-        ours.alpha.std(axis=(0, 1)), ours.beta.std(axis=(0, 1)),
-        ours.gamma.std(axis=(0, 1))])
+        ours.means.std(axis=(0, 1)), ours.stddevs.std(axis=(0, 1)),
+        ours.rho.std(axis=(0, 1))])
     print('least-squares errors over posterior widths, median over '
           f'parameters: {np.median(errors[:, 1:] / widths):.3f}')
     if not arguments.no_literal:

@@ -23,7 +23,7 @@ from photutils_mgauss.files.image_layers import read_wcs
 # Where this package is imported from, also from another folder.
 SOURCES = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get(
     'PYTHONPATH')])]
-COMMANDS = ('psf', 'photometry', 'motions', 'report', 'demo')
+COMMANDS = ('psf', 'photometry', 'motions', 'report', 'info', 'demo')
 
 
 def mgauss(*arguments, folder=None):
@@ -134,7 +134,7 @@ def test_images_become_psfs_of_their_own_stars(chain):
 
 def test_catalogues_have_places_on_the_sky_that_are_true(chain):
     table = QTable.read(chain / 'night1_cat.ecsv')
-    assert {'x_fit', 'xy_cov', 'ra_err', 'radec_cov'} <= set(table.colnames)
+    assert {'x_fit', 'xy_cov', 'ra_error', 'radec_cov'} <= set(table.colnames)
     assert str(table['flux_fit'].unit) == 'electron'
     record = table.meta['mgauss']
     assert record['options']['fit_shape'] == 11
@@ -461,7 +461,7 @@ def test_the_version_is_told(capsys):
 
 def test_help_comes_without_loading_what_computes():
     code = ('import sys, photutils_mgauss.cli.command as cli\n'
-            'cli._parser().format_help()\n'
+            'cli.make_parser().format_help()\n'
             'print(*sys.modules)')
     loaded = subprocess.run([sys.executable, '-c', code], check=True,
                             capture_output=True, text=True).stdout.split()

@@ -52,9 +52,12 @@ def test_the_smallest_number_that_meets_all_thresholds_is_chosen():
     assert select_n_components(IMAGE, r2_error=1, rms_residual=1e-5) == 3
 
 
-def test_thresholds_must_be_given_and_met():
-    with pytest.raises(ValueError, match=r'one of r2_error.*got none'):
-        select_n_components(IMAGE)
+def test_without_thresholds_the_smallest_bic_decides(rng):
+    noisy = IMAGE + 2e-5 * rng.standard_normal(IMAGE.shape)
+    assert select_n_components(noisy, (1, 2, 3, 4), error=2e-5) == 3
+
+
+def test_thresholds_must_be_met():
     with pytest.raises(ValueError, match='must reach further than 2'):
         select_n_components(IMAGE, (1, 2), max_residual=1e-6)
     with pytest.raises(TypeError, match='n_components must be an integer'):

@@ -23,7 +23,7 @@ def image():
 @pytest.fixture(scope='module')
 def posterior(image):
     return sample_mixture(image, 2, draws=300, tune=200, chains=2, cores=1,
-                          random_seed=11)
+                          rng=11)
 
 
 def test_the_chains_agree_and_have_many_independent_draws(posterior):
@@ -31,18 +31,18 @@ def test_the_chains_agree_and_have_many_independent_draws(posterior):
     assert len(table) == 14
     assert (table['r_hat'] < 1.03).all()
     assert (table['ess'] > 100).all()
-    assert posterior.omega.shape == (2, 300, 2)
-    assert posterior.alpha.shape == (2, 300, 2, 2)
+    assert posterior.weights.shape == (2, 300, 2)
+    assert posterior.means.shape == (2, 300, 2, 2)
 
 
 def test_the_posterior_is_where_and_as_wide_as_least_squares_says(posterior):
     fit = posterior.fit
     errors = np.sqrt(np.diag(fit.covariance)).reshape(2, 6)
-    pairs = [(posterior.omega * posterior.flux[..., None],
+    pairs = [(posterior.weights * posterior.flux[..., None],
               fit.flux * fit.mixture.weights, errors[:, 0]),
-             (posterior.alpha, fit.mixture.means, errors[:, 1:3]),
-             (posterior.beta, fit.mixture.stddevs, errors[:, 3:5]),
-             (posterior.gamma, fit.mixture.rho, errors[:, 5])]
+             (posterior.means, fit.mixture.means, errors[:, 1:3]),
+             (posterior.stddevs, fit.mixture.stddevs, errors[:, 3:5]),
+             (posterior.rho, fit.mixture.rho, errors[:, 5])]
     ratios = []
     for draws, value, error in pairs:
         assert (abs(draws.mean(axis=(0, 1)) - value) < error).all()
@@ -64,12 +64,12 @@ def test_the_mixture_and_draws_are_near_the_truth(posterior):
 def test_a_seed_makes_the_papers_posterior_repeatable(image):
     one, other = (sample_mixture(
         image, 2, prior='paper', pixel_scale=0.074, draws=40, tune=60,
-        chains=1, cores=1, random_seed=5) for _ in range(2))
-    assert (one.beta == other.beta).all()
+        chains=1, cores=1, rng=5) for _ in range(2))
+    assert (one.stddevs == other.stddevs).all()
     assert_allclose(one.flux, image.sum(), rtol=1e-9)
-    assert_allclose(one.omega.sum(axis=-1), 1)
+    assert_allclose(one.weights.sum(axis=-1), 1)
     # In arcsec inside, in pixels outside.
-    assert_allclose(one.beta.mean(axis=(0, 1)), one.fit.mixture.stddevs,
+    assert_allclose(one.stddevs.mean(axis=(0, 1)), one.fit.mixture.stddevs,
                     rtol=0.1)
 
 

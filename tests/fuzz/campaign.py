@@ -34,7 +34,7 @@ import numpy as np
 from astropy.coordinates import ICRS
 from astropy.io import fits
 from astropy.modeling import models
-from astropy.table import QTable
+from astropy.table import QTable, Table
 from astropy.wcs import WCS
 from gwcs import coordinate_frames
 from photutils.psf import ImagePSF
@@ -42,6 +42,9 @@ from photutils.psf import ImagePSF
 import photutils_mgauss as mg
 from photutils_mgauss.files import epsfs, image_layers
 from photutils_mgauss.files.tables import read_table
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from helpers import star_list_files
 
 SEED = 20260101
 LONGEST = 5.0
@@ -217,6 +220,21 @@ def read_chips(path):
     return mg.read_psfex(path, ext='all')
 
 
+def star_list(name):
+    program, write = star_list_files.FILES[name]
+    return write, lambda path: Table.read(path, format=f'mgauss.{program}')
+
+
+def write_columns(path):
+    path.write_text(star_list_files.DOLPHOT_COLUMNS)
+    path.with_name('described').write_text(star_list_files.DOLPHOT)
+
+
+def read_described(path):
+    return Table.read(path.with_name('described'), format='mgauss.dolphot',
+                      columns=path)
+
+
 KINDS = {
     'grid.fits': (lambda p: grid().write(p), mg.GriddedMixturePSF.read),
     'grid.asdf': (lambda p: grid().write(p), mg.GriddedMixturePSF.read),
@@ -244,7 +262,11 @@ KINDS = {
     'stars.ecsv': (lambda p: stars().write(p), read_table),
     'stars.xml': (lambda p: stars().write(p, format='votable'), read_table),
     'stars.fits': (lambda p: fits_stars().write(p), read_table),
+    'alone.columns': (write_columns, read_described),
+    **{name: star_list(name) for name in star_list_files.FILES},
 }
+TEXTS = ('.asdf', '.ecsv', '.xml', '.als', '.ap', '.coo', '.lis', '.cat',
+         '.xymq', '.columns', 'phot')
 
 
 # What happens to them.
@@ -339,7 +361,7 @@ COMMON = (truncate, flip, flip, overwrite, cut, repeat)
 def changes_for(name):
     if name.endswith('.gz'):
         return (*COMMON, inside, inside, inside)
-    if name.endswith(('.asdf', '.ecsv', '.xml')):
+    if name.endswith(TEXTS):
         return (*COMMON, *4 * (change_word,), drop_line, drop_line)
     return (*COMMON, *8 * (change_card,))
 
@@ -374,7 +396,7 @@ PARTS = {
     ImagePSF: lambda psf: [psf.data, psf.oversampling],
     WCS: words_of,
     gwcs.WCS: lambda wcs: [*wcs(3, 4), wcs.output_frame],
-    QTable: lambda table: [dict(table.items()), dict(table.meta)],
+    Table: lambda table: [dict(table.items()), dict(table.meta)],
     u.Quantity: lambda quantity: [quantity.unit, quantity.value],
     np.ndarray: lambda array: [array.shape, array.dtype, str(array.tolist())],
     dict: lambda values: [[key, values[key]] for key in values],

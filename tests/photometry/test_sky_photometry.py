@@ -68,7 +68,7 @@ def test_one_image_gives_what_photometry_gives(rng):
     for name in ('ra', 'dec'):
         assert_allclose(got[name].to_value(u.mas), want[name].to_value(u.mas),
                         rtol=0, atol=1e-3)
-    for name in ('ra_err', 'dec_err', 'radec_cov'):
+    for name in ('ra_error', 'dec_error', 'radec_cov'):
         assert_allclose(got[name].value, want[name].value, rtol=1e-3,
                         atol=1e-3)
     assert_allclose(got['flux_fit'][:, 0].value, table['flux_fit'].value,
@@ -84,7 +84,7 @@ def test_several_images_have_joint_errors_that_are_true(rng):
         found = SkyCoord(table['ra'], table['dec'])
         east, north = sky.spherical_offsets_to(found)
         offsets += [east.to_value(u.mas), north.to_value(u.mas)]
-        errors += [table['ra_err'].value, table['dec_err'].value]
+        errors += [table['ra_error'].value, table['dec_error'].value]
     pulls = np.concatenate(offsets) / np.concatenate(errors)
     assert abs(pulls.mean()) < 4 / np.sqrt(pulls.size)
     assert abs(pulls.std() - 1) < 4 / np.sqrt(2 * pulls.size)
@@ -108,15 +108,15 @@ def test_a_star_off_one_image_is_measured_on_the_others(rng):
     without = fit_many(frames, sky)
     assert np.isnan(with_far['flux_fit'][:, 3]).all()
     assert_allclose(with_far['ra'].value, without['ra'].value, atol=1e-12)
-    assert_allclose(with_far['ra_err'].value, without['ra_err'].value)
+    assert_allclose(with_far['ra_error'].value, without['ra_error'].value)
 
 
 def test_a_coordinate_nobody_sees_is_not_a_number(rng):
     sky, frames = images(rng, 2e4)
     lost = SkyCoord([sky[0].ra.deg, 10], [sky[0].dec.deg, -80], unit='deg')
     table = fit_many(frames, lost)
-    assert np.isfinite(table['ra_err'][0])
-    assert np.isnan(table['ra_err'][1])
+    assert np.isfinite(table['ra_error'][0])
+    assert np.isnan(table['ra_error'][1])
 
 
 def test_positions_at_the_pole_have_errors_along_the_parallel():
@@ -124,7 +124,7 @@ def test_positions_at_the_pole_have_errors_along_the_parallel():
     stars = QTable({'x_fit': [81.0, 10.0], 'y_fit': [80.0, 140.0],
                     'x_err': [0.01, 0.01], 'y_err': [0.01, 0.01]})
     table = add_sky_positions(stars, wcs)
-    for name in ('ra_err', 'dec_err'):
+    for name in ('ra_error', 'dec_error'):
         assert_allclose(table[name].value, 0.72, rtol=1e-6)
 
 
@@ -171,8 +171,8 @@ def test_photometry_on_the_sky_has_the_scatter_of_the_pixels(
     east, north = there[7].spherical_offsets_to(
         wcs.pixel_to_world(*xy.T).icrs)
     want = np.cov(east.to_value(u.mas), north.to_value(u.mas))
-    got = [[row['ra_err'].value**2, row['radec_cov'].value],
-           [row['radec_cov'].value, row['dec_err'].value**2]]
+    got = [[row['ra_error'].value**2, row['radec_cov'].value],
+           [row['radec_cov'].value, row['dec_error'].value**2]]
     assert_allclose(got, want, rtol=0.05, atol=0.02 * np.trace(want))
 
 

@@ -146,7 +146,7 @@ def test_stars_at_rest_in_one_image_are_those_of_fit_many(rng):
     for name in ('ra', 'dec'):
         assert_allclose(table[name].value, want[name].value, rtol=0,
                         atol=1e-5 * SCALE / 3.6e6)
-    assert_allclose(table['ra_error'].value, want['ra_err'].value, rtol=3e-3)
+    assert_allclose(table['ra_error'].value, want['ra_error'].value, rtol=3e-3)
     assert np.isnan(table['pmra'].value).all()
     assert any('position_only' in sentence for sentence in
                decode_motion_flags(table['flags'][0]))

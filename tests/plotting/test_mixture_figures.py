@@ -34,7 +34,7 @@ def fit():
 
 @pytest.mark.parametrize('axis', ['x', 'y'])
 def test_the_projected_mixture_passes_through_the_pixels(ax, fit, axis):
-    plotting.plot_projection(ax, fit, IMAGE, axis=axis, oversampling=2)
+    plotting.plot_projection(fit, IMAGE, axis=axis, oversampling=2, ax=ax)
     lines = {line.get_label(): line for line in ax.lines}
     assert set(lines) == {'70.0%', '30.0%', 'mixture', 'image'}
     data, model = lines['image'].get_data(), lines['mixture'].get_data()
@@ -44,7 +44,7 @@ def test_the_projected_mixture_passes_through_the_pixels(ax, fit, axis):
 
 
 def test_the_profile_is_the_brightest_row(ax, fit):
-    plotting.plot_profile(ax, fit, IMAGE)
+    plotting.plot_profile(fit, IMAGE, ax=ax)
     assert_allclose(ax.lines[0].get_ydata(), IMAGE[15] / IMAGE.max())
     assert ax.get_yscale() == 'log'
 
@@ -52,18 +52,18 @@ def test_the_profile_is_the_brightest_row(ax, fit):
 def test_residuals_of_several_numbers_share_their_colours():
     axes = Figure().subplots(1, 3)
     table = compare_n_components(IMAGE, (1, 2))
-    plotting.plot_comparison_of_numbers(axes, IMAGE, table)
+    plotting.plot_comparison_of_numbers(IMAGE, table, axes=axes)
     shown = axes[1].images[0]
     assert_allclose(shown.get_array(),
                     table.meta['fits'][0].residual / IMAGE.max())
     assert shown.get_clim() == axes[2].images[0].get_clim()
     assert axes[2].get_title().startswith('K = 2, ')
     with pytest.raises(ValueError, match='axes must be one more'):
-        plotting.plot_comparison_of_numbers(axes[:2], IMAGE, table)
+        plotting.plot_comparison_of_numbers(IMAGE, table, axes=axes[:2])
 
 
 def test_ellipses_lie_at_one_sigma(ax):
-    plotting.plot_ellipses(ax, TRUTH)
+    plotting.plot_ellipses(TRUTH, ax=ax)
     offset = np.array(ax.lines[0].get_data()) - TRUTH.means[0][:, None]
     precision = np.linalg.inv(TRUTH.covariances[0])
     assert_allclose(np.einsum('in,ij,jn->n', offset, precision, offset), 1)
@@ -80,23 +80,24 @@ def posterior(rng):
 
 
 def test_posteriors_and_traces_show_every_number(posterior):
-    for name, n in (('alpha', 4), ('omega', 2), ('sigma', 1)):
-        ax = plotting.plot_posterior(Figure().subplots(), posterior, name)
+    for name, n in (('means', 4), ('weights', 2), ('sigma', 1),
+                    ('x_mean_2', 1)):
+        ax = plotting.plot_posterior(posterior, name, ax=Figure().subplots())
         assert len(ax.patches) == n
-        ax = plotting.plot_trace(Figure().subplots(), posterior, name)
+        ax = plotting.plot_trace(posterior, name, ax=Figure().subplots())
         assert len(ax.lines) == 2 * n
-    with pytest.raises(ValueError, match="name must be one of 'omega'"):
-        plotting.plot_trace(Figure().subplots(), posterior, 'delta')
+    with pytest.raises(ValueError, match="name must be one of 'weights'"):
+        plotting.plot_trace(posterior, 'delta', ax=Figure().subplots())
 
 
 def test_the_model_graph_names_all_parameters(ax):
-    plotting.plot_model_graph(ax, 3, (30, 30))
+    plotting.plot_model_graph(3, (30, 30), ax=ax)
     words = ' '.join(text.get_text() for text in ax.texts)
     for word in ('sigma', 'omega', 'alpha', 'beta', 'gamma', '30 x 30'):
         assert word in words
 
 
 def test_a_map_states_mean_and_scatter(ax):
-    plotting.plot_shape_map(ax, [0, 1, 2], [0, 1, 2], [0.1, 0.3, np.nan],
-                            label='size')
+    plotting.plot_shape_map([0, 1, 2], [0, 1, 2], [0.1, 0.3, np.nan],
+                            label='size', ax=ax)
     assert 'size: +2.00e-01' in ax.get_title()

@@ -27,7 +27,7 @@ def solutions():
 
 def test_every_detection_of_an_epoch_has_an_arrow(axes, solutions):
     solution = solutions[1]
-    solution.plot_residuals(axes, 1)
+    solution.plot_residuals(1, ax=axes)
     arrows = list(axes.collections)
     assert sum(len(one.get_offsets()) for one in arrows) == 120
     rows = solution.residuals[solution.residuals['epoch'] == 1]
@@ -38,7 +38,7 @@ def test_every_detection_of_an_epoch_has_an_arrow(axes, solutions):
 
 
 def test_the_diagram_shows_stars_and_references(axes, solutions):
-    solutions[1].plot_motions(axes)
+    solutions[1].plot(ax=axes)
     shown = [len(line.get_xdata()) for line in axes.lines[:2]]
     assert sorted(shown) == [40, 80]
     assert axes.xaxis_inverted()
@@ -48,7 +48,7 @@ def test_a_table_read_from_a_file_is_drawn_like_the_one_written(
         axes, solutions, tmp_path):
     from photutils_mgauss.plotting import plot_proper_motions
     solutions[1].stars.write(tmp_path / 'stars.ecsv')
-    plot_proper_motions(axes, QTable.read(tmp_path / 'stars.ecsv'))
+    plot_proper_motions(QTable.read(tmp_path / 'stars.ecsv'), ax=axes)
     shown = [len(line.get_xdata()) for line in axes.lines[:2]]
     assert sorted(shown) == [40, 80]
 
@@ -59,11 +59,11 @@ def test_errors_against_magnitude_and_epochs_are_those_of_the_table(
         plot_errors_by_epochs,
         plot_motion_errors,
     )
-    plot_motion_errors(axes, solutions[1].stars, np.arange(120))
+    plot_motion_errors(solutions[1].stars, np.arange(120), ax=axes)
     stars = solutions[1].stars
     assert_allclose(axes.lines[0].get_ydata(),
                     stars['pmra_error'][stars['reference'] == ''].value)
-    plot_errors_by_epochs(axes, solutions)
+    plot_errors_by_epochs(solutions, ax=axes)
     line = axes.lines[2]
     assert_allclose(line.get_xdata(), [2, 3])
     measured = [one.stars['pmra_error'][one.stars['reference'] == '']

@@ -205,6 +205,23 @@ def test_encircled_energy_ends_at_one_and_keeps_the_shape():
         mixture.encircled_energy(-1)
 
 
+@pytest.mark.parametrize('rho', [0, 0.6])
+def test_the_width_of_one_gaussian_is_the_closed_form(rho):
+    psf = GaussianMixture.from_stddevs([1], [[0.3, -0.2]], [[1.2, 1.7]], rho)
+    area = np.pi * 2 * np.log(2) * np.sqrt(np.linalg.det(psf.covariances[0]))
+    assert_allclose(psf.fwhm, 2 * np.sqrt(area / np.pi), rtol=1e-6)
+
+
+def test_the_width_is_that_of_the_light_above_half_of_the_peak():
+    psf = GaussianMixture.from_stddevs(
+        [0.6, 0.4], [[0.1, 0], [-0.6, 0.4]], [[0.9, 1.1], [2.3, 1.9]],
+        [0.2, -0.3])
+    points = np.linspace(-4, 4, 1601)
+    image = psf.evaluate(points, points[:, None])
+    area = (image > image.max() / 2).sum() * (points[1] - points[0])**2
+    assert_allclose(psf.fwhm, 2 * np.sqrt(area / np.pi), rtol=1e-3)
+
+
 @given(st.lists(mixtures(), min_size=4, max_size=4), st.integers(0, 3),
        numbers(-4, 4), numbers(-4, 4))
 @settings(**SETTINGS)
