@@ -25,5 +25,5 @@ __getattr__, __dir__, __all__ = hand_on(__name__, {
     'fit_crowded_psf': 'own_psf',
     'inject_and_recover': 'injection',
     'InjectionResult': 'injection',
-    'UnfinishedTilesError': 'photometry',
+    'UnfinishedTilesError': 'unfinished',
 })

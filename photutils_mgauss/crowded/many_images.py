@@ -3,12 +3,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from photutils_mgauss.crowded.many_equations import FARTHEST, reach_of
 from photutils_mgauss.crowded.many_plan import ManyPlan
 from photutils_mgauss.crowded.many_table import as_qtable, no_stars
 from photutils_mgauss.crowded.plan import run
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.crowded.table import NO_COVARIANCE, NO_OVERLAP
 from photutils_mgauss.photometry.many_images import (
+    add_motions,
     add_places,
     grid_positions,
     read_field,
@@ -17,7 +19,7 @@ from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.checkpoint import Checkpoint
 
 
-def fit_images(photometry, images, listed):
+def fit_images(photometry, images, listed, *, motions):
     """
     Return the table of all images, what is unfinished, and errors.
 
@@ -25,7 +27,7 @@ def fit_images(photometry, images, listed):
     ----------
     photometry : CrowdedMixturePhotometry
         Whose settings are used.
-    images, listed
+    images, listed, motions
         As of its method `fit_images`.
     """
     field = read_field(images)
@@ -40,12 +42,21 @@ def fit_images(photometry, images, listed):
         # What is known of fluxes and places is said once for all images.
         [replace(one, count_slope=0.0) for one in each],
         replace(each[0], gain=None), field.grid,
-        np.ones(len(each)), photometry.tile_shape, photometry.overlap, given,
+        np.ones(len(each)), _factors(field, motions), photometry.tile_shape,
+        photometry.overlap, given,
         Checkpoint(photometry.checkpoint)).with_scales()
     outcomes, errors = run(plan, photometry.executor, photometry.progress_bar)
     left = [core for core, outcome in zip(plan.cores, outcomes, strict=True)
             if outcome is None]
-    return _table(plan, outcomes, field.unit), left, errors
+    return _table(plan, outcomes, field), left, errors
+
+
+def _factors(field, motions):
+    """Return how images see places and, if asked for, motions (E, 2, p)."""
+    factors = np.tile(np.eye(2), (len(field.pixels), 1, 2 if motions else 1))
+    if motions:
+        factors[:, :, 2:] *= field.time_since_mean()[:, None, None]
+    return factors
 
 
 def _psfs(photometry, field):
@@ -53,9 +64,10 @@ def _psfs(photometry, field):
             for psf, pixels in zip(field.psfs, field.pixels, strict=True)]
 
 
-def _table(plan, outcomes, unit):
+def _table(plan, outcomes, field):
     done = [outcome for outcome in outcomes if outcome is not None]
-    stars = Stars.joined([no_stars(len(plan.images)),
+    stars = Stars.joined([no_stars(len(plan.images),
+                                   plan.factors.shape[2]),
                           *(outcome.stars for outcome in done)])
     n_pixels = sum(outcome.n_pixels for outcome in done)
     meta = {'n_stars': len(stars), 'scales': plan.scales,
@@ -65,8 +77,14 @@ def _table(plan, outcomes, unit):
     else:
         stars.sort('y', 'x')
     place = stars.x, stars.y, stars.place
-    table = as_qtable(stars, unit, meta)
+    # Of what is not seen only what was taken before comes out.
+    reach = reach_of(plan.factors)[2:]
+    spread = np.sqrt(np.einsum('nii->ni', stars.place[:, 2:, 2:]))
+    rate = np.where(spread * reach < FARTHEST / 2, stars.rate, np.nan)
+    table = as_qtable(stars, field.unit, meta)
     add_places(table, plan.grid, *place)
+    if plan.factors.shape[2] > 2:
+        add_motions(table, plan.grid, *place, rate, field.years.mean())
     return table
 
 

@@ -29,7 +29,7 @@ _SAMPLE = 512
 def outcome_of(job):
     """Solve a tile."""
     if job.is_empty:
-        return Outcome(no_stars(job.n_images))
+        return Outcome(no_stars(job.n_images, job.factors.shape[2]))
     tile = solve_many(job)
     chi2 = sum(float((one.weight * one.residual**2).sum())
                for one in tile.models)
@@ -45,7 +45,8 @@ class ManyPlan(Tiles):
 
     ``images`` are `PixelData`, ``psfs`` their `LocalPSF`, ``each`` the
     `TileOptions` of single images and ``options`` those of all; ``grid`` has
-    the ``shape`` of the field and the maps ``to_image`` and ``to_grid``.
+    the ``shape`` of the field and the maps ``to_image`` and ``to_grid``,
+    ``factors`` are those of a `ManyJob`.
     """
 
     solve = staticmethod(outcome_of)
@@ -56,6 +57,7 @@ class ManyPlan(Tiles):
     options: TileOptions
     grid: object
     scales: np.ndarray
+    factors: np.ndarray
     tile_shape: tuple | None
     overlap: int
     given: Stars | None = None
@@ -86,7 +88,7 @@ class ManyPlan(Tiles):
                         (u_low, v_low), parts[k].origin[::-1])
                 for k in there]
         return ManyJob([parts[k] for k in there], maps, there,
-                       self.scales[there], self.options,
+                       self.scales[there], self.factors[there], self.options,
                        (v_high - v_low, u_high - u_low), (v_low, u_low),
                        core, len(self.images), given_in(self.given, seen))
 

@@ -28,20 +28,21 @@ from photutils_mgauss.utils.flags import (
 )
 
 # The columns of a star, and those it has once for each image.
-_COLUMNS = ('number', 'x', 'y', 'x_init', 'y_init', 'place', 'significance',
-            'n_images', 'reduced_chi2', 'flags', 'neighbor_distance',
-            'neighbor_correlation', 'found_in')
+_COLUMNS = ('number', 'x', 'y', 'x_init', 'y_init', 'rate', 'place',
+            'significance', 'n_images', 'reduced_chi2', 'flags',
+            'neighbor_distance', 'neighbor_correlation', 'found_in')
 _WHOLE = ('number', 'n_images', 'flags', 'found_in')
 _EACH = ('x_image', 'y_image', 'fluxes', 'flux_err', 'local_bkg',
          'n_pixels_fit', 'image_chi2', 'crowding')
 _COUNTS = ('n_pixels_fit',)
 
 
-def no_stars(n_images):
+def no_stars(n_images, p):
     """Return what `tabulate` does of a tile without stars."""
     columns = {name: np.empty(0, int if name in _WHOLE else float)
                for name in _COLUMNS}
-    columns['place'] = np.empty((0, 2, 2))
+    columns['rate'] = np.empty((0, p - 2))
+    columns['place'] = np.empty((0, p, p))
     columns.update({name: np.empty((0, n_images), int if name in _COUNTS
                                    else float) for name in _EACH})
     return Stars.of_columns(columns)

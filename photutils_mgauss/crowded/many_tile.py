@@ -10,7 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from photutils_mgauss import kernels
-from photutils_mgauss.crowded.many_equations import ManyEquations
+from photutils_mgauss.crowded.many_equations import (
+    ManyEquations,
+    reach_of,
+)
 from photutils_mgauss.crowded.model import Model
 from photutils_mgauss.crowded.stars import Neighbours, Stars
 from photutils_mgauss.crowded.tile import CELL, REST, ROAM, TileOptions
@@ -66,16 +69,19 @@ class ManyJob:
     A piece of the sky with its margin, and the pieces of images that show it.
 
     ``parts`` are the `TileJob` of those images, ``images`` their numbers and
-    ``scales`` their relative throughput. ``shape`` and ``origin`` (rows
-    first) are those of the piece on the grid, ``core`` (v_low, v_high, u_low,
-    u_high) what of it is reported; ``n_images`` is the number of all images,
-    ``given`` are the stars of a list, in columns and rows of the piece.
+    ``scales`` their relative throughput, ``factors`` (E, 2, p) how they see
+    what places are made of: column and row, and what moves stars. ``shape``
+    and ``origin`` (rows first) are those of the piece on the grid, ``core``
+    (v_low, v_high, u_low, u_high) what of it is reported; ``n_images`` is the
+    number of all images, ``given`` are the stars of a list, in columns and
+    rows of the piece.
     """
 
     parts: list
     maps: list
     images: np.ndarray
     scales: np.ndarray
+    factors: np.ndarray
     options: TileOptions
     shape: tuple
     origin: tuple
@@ -115,7 +121,8 @@ class ManyTile:
     models : list of SharedModel
     stars : Stars
         In columns and rows of the grid; fluxes are those of an image of scale
-        one, made of all images.
+        one, made of all images. One more column, ``rate`` (n, p - 2), is what
+        moves them.
     equations : ManyEquations
     points : list of kernels.Points
     phases : list of kernels.Phases
@@ -134,7 +141,7 @@ class ManyTile:
         self.rejected, self.repeats = np.empty((0, 2)), []
         self.widths = [np.empty(0)] * len(job.parts)
         self.moved = np.empty(0)
-        self.stars = Stars([], [], [])
+        self.stars = self._at_rest(Stars([], [], []))
         # Pixels of the grid may be smaller than those of some images.
         middle = [np.array([n / 2]) for n in job.shape[::-1]]
         self.pixels = [float(np.linalg.norm(np.linalg.inv(
@@ -150,6 +157,15 @@ class ManyTile:
         """The area of the sharpest PSF in pixels of the grid."""
         return min(model.psf.area * size**2 for model, size in zip(
             self.models, self.pixels, strict=True))
+
+    def _at_rest(self, stars):
+        """Return stars with a column for what moves them."""
+        return stars.replaced(rate=np.zeros((
+            len(stars), self.job.factors.shape[2] - 2)))
+
+    def _places(self):
+        """Return what places are made of (n, p)."""
+        return np.column_stack([self.stars.x, self.stars.y, self.stars.rate])
 
     # What follows keeps models and equations up to date with the stars.
 
@@ -174,9 +190,11 @@ class ManyTile:
     def _seen(self, stars, fluxes):
         """Return stars as each image has them."""
         out = []
-        for model, one, flux in zip(self.models, self.job.maps, fluxes,
-                                    strict=True):
-            x, y = one(stars.x, stars.y)
+        for model, one, factor, flux in zip(
+                self.models, self.job.maps, self.job.factors, fluxes,
+                strict=True):
+            shift = stars.rate @ factor[:, 2:].T
+            x, y = one(stars.x + shift[:, 0], stars.y + shift[:, 1])
             ny, nx = model.data.shape
             away = np.maximum(np.maximum(-x, x - nx + 1),
                               np.maximum(-y, y - ny + 1)) > _OUTSIDE
@@ -186,6 +204,7 @@ class ManyTile:
 
     def start(self, stars, fluxes):
         """Put stars, of fluxes (E, n), in place of all others."""
+        stars = self._at_rest(stars)
         self._connect(stars, self._slopes(stars))
         for model, own in zip(self.models, self._seen(stars, fluxes),
                               strict=True):
@@ -203,6 +222,7 @@ class ManyTile:
 
     def admit(self, found, fluxes):
         """Add stars of fluxes (E, n); the others stay as they are."""
+        found = self._at_rest(found)
         self._connect(Stars.joined([self.stars, found]), [
             np.concatenate([model.slopes, new]) for model, new in zip(
                 self.models, self._slopes(found), strict=True)])
@@ -260,12 +280,13 @@ class ManyTile:
         self._move(kept_place)
         for model, flux, level in zip(self.models, kept_light, levels,
                                       strict=True):
-            model.take(_step(flux, np.zeros_like(place)), level)
+            model.take(_step(flux, np.zeros((flux.size, 2))), level)
         self.refresh()
 
     def _move(self, place):
         self.stars.x = self.stars.x + place[:, 0]
         self.stars.y = self.stars.y + place[:, 1]
+        self.stars.rate = self.stars.rate + place[:, 2:]
 
     def polish(self, damping, n_steps):
         """Take steps without a new layout, until all stars are at rest."""
@@ -278,20 +299,21 @@ class ManyTile:
                 break
 
     def _trust_region(self):
-        """Return limits (2, E, n) of fluxes and (2, n, 2) of places."""
+        """Return limits (2, E, n) of fluxes and (2, n, p) of places."""
         flux = self.fluxes
         roam = _FREE * self.equations.flux_errors()
-        place = np.column_stack([self.stars.x, self.stars.y])
-        reach = np.minimum(ROAM, self.stars.bound)[:, None]
+        place = self._places()
+        reach = np.minimum(ROAM, self.stars.bound)[:, None] / reach_of(
+            self.job.factors)
         return (np.stack([np.minimum(flux / 2, flux - roam),
                           np.maximum(2 * flux, flux + roam)]),
                 np.stack([place - reach, place + reach]))
 
     def _polish_once(self, damping, region):
         light, place, levels = self.equations.solve(damping)
-        self.moved = np.abs(place).max(axis=1, initial=0)
-        flux, here = self.fluxes, np.column_stack([self.stars.x,
-                                                   self.stars.y])
+        self.moved = np.abs(place * reach_of(self.job.factors)).max(
+            axis=1, initial=0)
+        flux, here = self.fluxes, self._places()
         light = np.clip(flux + light, *region[0]) - flux
         place = np.clip(here + place, *region[1]) - here
         place[self.moved <= REST] = 0
@@ -299,7 +321,8 @@ class ManyTile:
         restless = (np.abs(light) > REST * self.equations.flux_errors()) | (
             self.moved > REST)
         for k, model in enumerate(self.models):
-            shift = np.einsum('nij,nj->ni', model.slopes, place)
+            shift = np.einsum('nij,nj->ni', model.slopes,
+                              place @ self.job.factors[k].T)
             step = _step(np.where(restless[k], light[k], 0), shift)
             model.take_in_place(step, levels[k], np.flatnonzero(restless[k]))
         self._form_equations()

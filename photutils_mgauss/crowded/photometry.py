@@ -20,6 +20,7 @@ from photutils_mgauss.crowded.table import (
     positions,
 )
 from photutils_mgauss.crowded.tile import TileOptions
+from photutils_mgauss.crowded.unfinished import UnfinishedTilesError
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.psf.star_errors import add_psf_errors
@@ -30,58 +31,12 @@ from photutils_mgauss.utils.per_thread import PerThread, keep
 from photutils_mgauss.utils.star_columns import column_values, read_sources
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
-__all__ = ['CrowdedMixturePhotometry', 'UnfinishedTilesError']
+__all__ = ['CrowdedMixturePhotometry']
 
 # A PSF whose size is off by more than this fraction is warned of.
 _WIDTH_TOLERANCE = 0.1
 # Stars are drawn out to where this fraction of the noise is left of them.
 _FAINTEST = 1e-3
-
-
-class UnfinishedTilesError(RuntimeError):
-    """
-    Raised when some tiles of an image could not be solved.
-
-    Parameters
-    ----------
-    unfinished : list of (y_low, y_high, x_low, x_high) tuple of int
-        The parts of the image, in pixels, without a result.
-    table : `~astropy.table.QTable`
-        The stars of the tiles that were finished.
-
-    Examples
-    --------
-    Take what there is, and solve the rest again:
-
-    >>> import numpy as np
-    >>> from concurrent.futures import ThreadPoolExecutor
-    >>> from photutils_mgauss import (CrowdedMixturePhotometry,
-    ...                               GaussianMixture, GriddedMixturePSF,
-    ...                               UnfinishedTilesError)
-    >>> mixture = GaussianMixture([1], [[0, 0]], [[[0.7, 0], [0, 0.8]]])
-    >>> psf = GriddedMixturePSF([mixture], [(0, 0)])
-    >>> pool = ThreadPoolExecutor()
-    >>> pool.shutdown()  # all of its workers are gone
-    >>> phot = CrowdedMixturePhotometry(psf, executor=pool)
-    >>> try:
-    ...     table = phot(np.ones((40, 50)), error=np.ones((40, 50)))
-    ... except UnfinishedTilesError as error:
-    ...     table, left = error.table, error.unfinished
-    >>> left
-    [(0, 40, 0, 50)]
-    >>> len(table)
-    0
-    """
-
-    def __init__(self, unfinished, table):
-        self.unfinished = unfinished
-        self.table = table
-        super().__init__(unfinished, table)
-
-    def __str__(self):
-        return (f'{len(self.unfinished)} tiles were not finished, at (y_low, '
-                f'y_high, x_low, x_high) = {self.unfinished}; the stars of '
-                f'the others are in the attribute table')
 
 
 class CrowdedMixturePhotometry:
@@ -316,7 +271,7 @@ class CrowdedMixturePhotometry:
             raise UnfinishedTilesError(unfinished, table) from errors[0]
         return table
 
-    def fit_images(self, images, stars=None):
+    def fit_images(self, images, stars=None, *, motions=False):
         """
         Find and fit the stars of one field in many images together.
 
@@ -333,12 +288,15 @@ class CrowdedMixturePhotometry:
         stars : `~astropy.table.Table` or SkyCoord, optional
             The stars to report, with ``ra`` and ``dec`` [deg]. None is added,
             none left out, and the result has their order.
+        motions : bool, optional
+            Whether each star has a proper motion of its own; for `ImageEpoch`.
 
         Returns
         -------
         `~astropy.table.QTable`
-            ``id``, ``ra``, ``dec`` [deg], ``ra_err``, ``dec_err`` [mas] and
-            ``radec_cov`` [mas^2]; for each of E images ``x_fit``, ``y_fit``
+            ``id``, ``ra``, ``dec`` [deg], ``ra_error``, ``dec_error`` [mas],
+            ``radec_cov`` [mas^2] and, with motions, ``pmra``, ``pmdec``
+            [mas / yr] with errors; for each of E images ``x_fit``, ``y_fit``
             [pix], ``flux``, ``flux_err``, ``local_bkg``, ``n_pixels_fit``,
             ``image_chi2`` and ``crowding``, (n, E), NaN where an image does
             not show the star; ``n_images`` that do, and for all of them
@@ -377,7 +335,8 @@ class CrowdedMixturePhotometry:
         (1, (1, 2))
         """
         from photutils_mgauss.crowded.many_images import fit_images
-        table, unfinished, errors = fit_images(self, images, stars)
+        table, unfinished, errors = fit_images(self, images, stars,
+                                               motions=motions)
         if unfinished:
             raise UnfinishedTilesError(unfinished, table) from errors[0]
         return table

@@ -173,12 +173,17 @@ def evidence_beside(column, row, fit, points, phases, planes, limits, side,
                     out.information[v, u] = known
 
 
+# Image k shows a star at the place F_k q: q are the p numbers that all images
+# have in common, its column and row and what else moves it, and F_k (2, p),
+# the same for all stars, are the factors of the image.
+
 class Together(NamedTuple):
     """
     Stars fitted with up to `MOST_TOGETHER` - 1 of their neighbours.
 
-    Star i is the first of the first count[i] of members (n, m); free (n, 2 m,
-    2 m) is the information on their places, and in the end its inverse.
+    Star i is the first of the first count[i] of members (n, m); free (n, p m,
+    p m) is the information on what places are made of, and in the end its
+    inverse.
     """
 
     members: np.ndarray
@@ -196,26 +201,29 @@ class Work(NamedTuple):
 
 
 @inner
-def _divide(i, together, stars, pairs, where, work):
+def _divide(i, together, stars, pairs, factors, where, work):
     """
     Put the matrix of a star and its neighbours into work, fluxes apart.
 
     light becomes the factor of the fluxes' own matrix, with a diagonal of 1
-    before, and share (m, 2 m) that times what couples fluxes to places.
+    before, and share (m, p m) that times what couples fluxes to places.
     """
     members, count = together.members[i], together.count[i]
     whole, light, share, scale = work
+    p = factors.shape[1]
     joint_matrix(members, count, stars.matrix, stars.blocks, pairs.indptr,
-                  pairs.neighbour, where, whole)
+                 pairs.neighbour, where, whole)
     for a in range(count):
         for b in range(count):
             light[a, b] = whole[3 * a, 3 * b]
-        for b in range(2 * count):
-            share[a, b] = whole[3 * a, 3 * (b // 2) + 1 + b % 2]
+            for q in range(p):
+                share[a, p * b + q] = (
+                    whole[3 * a, 3 * b + 1] * factors[0, q]
+                    + whole[3 * a, 3 * b + 2] * factors[1, q])
     scale_matrix(light, count, scale)
     cholesky(light, count, 1e-12)
     for a in range(count):
-        for b in range(2 * count):
+        for b in range(p * count):
             value = scale[a] * share[a, b]
             for c in range(a):
                 value -= light[a, c] * share[c, b]
@@ -223,25 +231,30 @@ def _divide(i, together, stars, pairs, where, work):
 
 
 @kernel(allocates=True)
-def add_places(first, stars, pairs, together):
+def add_places(first, stars, pairs, factors, together):
     """
     Add what an image says of places, its fluxes free, to together.free.
 
     Of stars from the first on; members are made here and stay.
     """
-    m = together.members.shape[1]
+    m, p = together.members.shape[1], factors.shape[1]
     work = Work(np.empty((3 * m, 3 * m)), np.empty((m, m)),
-                np.empty((m, 2 * m)), np.empty(m))
+                np.empty((m, p * m)), np.empty(m))
     where = np.full(stars.matrix.shape[0], -1)
     for i in range(together.count.size):
         together.count[i] = members_of(
             first + i, pairs.indptr, pairs.neighbour, together.members[i])
-        _divide(i, together, stars, pairs, where, work)
+        _divide(i, together, stars, pairs, factors, where, work)
         count = together.count[i]
-        for a in range(2 * count):
-            for b in range(2 * count):
-                value = work.whole[3 * (a // 2) + 1 + a % 2,
-                                   3 * (b // 2) + 1 + b % 2]
+        for a in range(p * count):
+            at, q = 3 * (a // p), a % p
+            for b in range(p * count):
+                to, r = 3 * (b // p), b % p
+                value = 0.0
+                for c in range(2):
+                    for d in range(2):
+                        value += (factors[c, q] * factors[d, r]
+                                  * work.whole[at + 1 + c, to + 1 + d])
                 for c in range(count):
                     value -= work.share[c, a] * work.share[c, b]
                 together.free[i, a, b] += value
@@ -250,17 +263,18 @@ def add_places(first, stars, pairs, together):
 @kernel(allocates=True)
 def invert_places(together):
     """Overwrite together.free by its inverse, NaN where it has none."""
-    m = together.members.shape[1]
-    scale, column = np.empty(2 * m), np.empty(2 * m)
-    factor = np.empty((2 * m, 2 * m))
+    largest, m = together.free.shape[1], together.members.shape[1]
+    scale, column = np.empty(largest), np.empty(largest)
+    factor = np.empty((largest, largest))
     for i in range(together.count.size):
-        size = 2 * together.count[i]
+        size = largest // m * together.count[i]
         for a in range(size):
             for b in range(size):
                 factor[a, b] = together.free[i, a, b]
         scale_matrix(factor, size, scale)
-        solved = (scale[0] > 0 and scale[1] > 0
-                  and cholesky(factor, size, 1e-12))
+        solved = cholesky(factor, size, 1e-12)
+        for a in range(largest // m):
+            solved = solved and scale[a] > 0
         for a in range(size):
             for b in range(size):
                 column[b] = 1.0 if a == b else 0.0
@@ -278,25 +292,25 @@ def invert_places(together):
 
 
 @kernel(allocates=True)
-def flux_variances(first, stars, pairs, together, variance, correlation):
+def flux_variances(stars, pairs, factors, together, variance, correlation):
     """
     Put the variances of fluxes in an image into variance (n,).
 
     together.free is the covariance of places in all images. correlation (n,)
     takes that with the flux of the first neighbour, 0 if there is none.
     """
-    m = together.members.shape[1]
+    m, p = together.members.shape[1], factors.shape[1]
     work = Work(np.empty((3 * m, 3 * m)), np.empty((m, m)),
-                np.empty((m, 2 * m)), np.empty(m))
+                np.empty((m, p * m)), np.empty(m))
     where = np.full(stars.matrix.shape[0], -1)
-    columns, gains = np.empty((2, m)), np.empty((2, 2 * m))
+    columns, gains = np.empty((2, m)), np.empty((2, p * m))
     for i in range(together.count.size):
-        _divide(i, together, stars, pairs, where, work)
+        _divide(i, together, stars, pairs, factors, where, work)
         count = together.count[i]
         products = np.zeros((2, 2))
         for s in range(min(count, 2)):
             _light_column(s, count, work, columns[s])
-            for b in range(2 * count):
+            for b in range(p * count):
                 gains[s, b] = 0.0
                 for a in range(count):
                     gains[s, b] += columns[s, a] * work.share[a, b]
@@ -305,8 +319,8 @@ def flux_variances(first, stars, pairs, together, variance, correlation):
                 value = 0.0
                 for a in range(count):
                     value += columns[s, a] * columns[t, a]
-                for a in range(2 * count):
-                    for b in range(2 * count):
+                for a in range(p * count):
+                    for b in range(p * count):
                         value += (gains[s, a] * together.free[i, a, b]
                                   * gains[t, b])
                 products[s, t] = value * work.scale[s] * work.scale[t]
@@ -329,31 +343,37 @@ def _light_column(s, count, work, out):
 
 
 # The unknowns of the equations of E images with n stars are one flat vector:
-# n fluxes of each image, two numbers for the place of each star, then the
+# n fluxes of each image, p numbers for the places of each star, then the
 # levels of the nodes of each image's background.
 
 @kernel
-def apply_shared(k, n_images, first, v, stars, pairs, mesh, scratch, out):
+def apply_shared(k, factors, first, v, stars, pairs, mesh, scratch, out):
     """
     Add the product of the equations of image k with v to out.
 
-    Its levels begin at first. scratch is (2, 3 n + m).
+    factors (E, 2, p) are those of all images. Its levels begin at first;
+    scratch is (2, 3 n + m).
     """
-    n = stars.matrix.shape[0]
+    n, (n_images, _, p) = stars.matrix.shape[0], factors.shape
     own, product = scratch[0], scratch[1]
     light, place = k * n, n_images * n
     for i in range(n):
         own[3 * i] = v[light + i]
-        own[3 * i + 1] = v[place + 2 * i]
-        own[3 * i + 2] = v[place + 2 * i + 1]
+        x = y = 0.0
+        for q in range(p):
+            x += factors[k, 0, q] * v[place + p * i + q]
+            y += factors[k, 1, q] * v[place + p * i + q]
+        own[3 * i + 1], own[3 * i + 2] = x, y
     m = mesh.diagonal.size
     for i in range(m):
         own[3 * n + i] = v[first + i]
     apply_joint(own, stars, pairs, mesh, product)
     for i in range(n):
         out[light + i] += product[3 * i]
-        out[place + 2 * i] += product[3 * i + 1]
-        out[place + 2 * i + 1] += product[3 * i + 2]
+        for q in range(p):
+            out[place + p * i + q] += (
+                factors[k, 0, q] * product[3 * i + 1]
+                + factors[k, 1, q] * product[3 * i + 2])
     for i in range(m):
         out[first + i] += product[3 * n + i]
 
@@ -363,8 +383,8 @@ class Blocks(NamedTuple):
     What the inverses of stars' own blocks, and of nodes, are made of.
 
     The inverse of each flux's diagonal, own (E, n), what couples fluxes to
-    places, share (E, n, 2), the inverse of what is left of the places' blocks,
-    free (n, 2, 2), and that of the nodes' diagonals, level (m,).
+    places, share (E, n, p), the inverse of what is left of the places' blocks,
+    free (n, p, p), and that of the nodes' diagonals, level (m,).
     """
 
     own: np.ndarray
@@ -373,30 +393,31 @@ class Blocks(NamedTuple):
     level: np.ndarray
 
 
-@kernel
+@kernel(allocates=True)
 def precondition_shared(blocks, r, z):
     """Put the inverse blocks times r into z; return the product of both."""
     own, share, free, level = blocks
-    n_images, n = own.shape
-    place = n_images * n
+    (n_images, n), p = own.shape, free.shape[1]
+    place, left = n_images * n, np.empty(p)
     product = 0.0
     for i in range(n):
-        at = place + 2 * i
-        left_x, left_y = r[at], r[at + 1]
+        at = place + p * i
+        for q in range(p):
+            left[q] = r[at + q]
+            for k in range(n_images):
+                left[q] -= share[k, i, q] * r[k * n + i] * own[k, i]
+        for q in range(p):
+            z[at + q] = 0.0
+            for s in range(p):
+                z[at + q] += free[i, q, s] * left[s]
+            product += r[at + q] * z[at + q]
         for k in range(n_images):
-            light = r[k * n + i] * own[k, i]
-            left_x -= share[k, i, 0] * light
-            left_y -= share[k, i, 1] * light
-        x = free[i, 0, 0] * left_x + free[i, 0, 1] * left_y
-        y = free[i, 1, 0] * left_x + free[i, 1, 1] * left_y
-        z[at], z[at + 1] = x, y
-        product += r[at] * x + r[at + 1] * y
-        for k in range(n_images):
-            light = own[k, i] * (r[k * n + i] - share[k, i, 0] * x
-                                 - share[k, i, 1] * y)
-            z[k * n + i] = light
-            product += r[k * n + i] * light
-    first = place + 2 * n
+            light = r[k * n + i]
+            for q in range(p):
+                light -= share[k, i, q] * z[at + q]
+            z[k * n + i] = own[k, i] * light
+            product += r[k * n + i] * z[k * n + i]
+    first = place + p * n
     for m in range(level.size):
         z[first + m] = r[first + m] * level[m]
         product += r[first + m] * z[first + m]

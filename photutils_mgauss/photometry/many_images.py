@@ -443,13 +443,24 @@ class Field:
 
     ``pixels`` are `PixelData` with errors, ``psfs`` models of fixed shape or
     None, ``grid`` is the `~photutils_mgauss.sky.pixel_grid.PixelGrid` that
-    all have in common.
+    all have in common, ``years`` (E,) are the times, or None where images
+    come without.
     """
 
     pixels: list
     psfs: list
     unit: object
     grid: PixelGrid
+    years: np.ndarray | None
+
+    def time_since_mean(self):
+        """Return how long after the mean time images were taken (E,) [yr]."""
+        if self.years is None or np.ptp(self.years) == 0:
+            msg = ('images must be ImageEpoch of two times at least for '
+                   'motions=True, got '
+                   f'{"no times" if self.years is None else "one time"}')
+            raise ValueError(msg)
+        return self.years - self.years.mean()
 
 
 def read_field(images):
@@ -475,13 +486,18 @@ def read_field(images):
         msg = f'images must have one unit, got {units}'
         raise ValueError(msg)
     grid = PixelGrid.of(frames, [one.shape for one in pixels])
+    years = [getattr(one, 'year', None) for one in images]
     return Field([one.with_error() for one in pixels], list(psfs), units[0],
-                 grid)
+                 grid, None if None in years else np.array(years))
 
 
 def _read_any(entry):
     """Return pixels, PSF or None, and WCS of one image of a field."""
     if hasattr(entry, 'pixels') and hasattr(entry, 'wcs'):
+        if entry.velocity is not None:
+            msg = ('images must come without observer, got '
+                   f'{entry.observer!r:.80}: aberration is not known here')
+            raise ValueError(msg)
         return entry.pixels, entry.model, entry.wcs
     if not isinstance(entry, (tuple, list)) or len(entry) != 3:
         msg = ('images must hold (data, psf, wcs) or ImageEpoch, got '
@@ -508,8 +524,30 @@ def grid_positions(stars, grid):
 def add_places(table, grid, columns, rows, covariance):
     """Add positions on a grid (n,), of some covariance (n, 2, 2) [pix^2]."""
     vectors = grid.vectors(columns, rows)
-    _add_columns(table, vectors, grid.plane,
-                 grid.matrix @ covariance @ grid.matrix.T)
+    _add_columns(table, vectors, grid.plane, _turn(covariance[:, :2, :2],
+                                                   grid.matrix))
+
+
+def add_motions(table, grid, columns, rows, covariance, rates, year):
+    """
+    Add proper motions of stars at positions of a grid.
+
+    ``covariance`` (n, 4, 4) is that of positions and ``rates`` (n, 2)
+    [pix / yr]; NaN where these are not known.
+    """
+    local = np.moveaxis(grid.plane.local_inverse(grid.plane.project(
+        grid.vectors(columns, rows))), -1, 0) @ grid.matrix
+    motion = np.einsum('nij,nj->ni', local, rates)
+    spread = _turn(covariance[:, 2:, 2:], local)
+    known = np.isfinite(motion).all(axis=1)
+    for i, name in enumerate(('pmra', 'pmdec')):
+        table[name] = motion[:, i] * u.mas / u.yr
+        table[f'{name}_error'] = np.where(known, np.sqrt(
+            spread[:, i, i]), np.nan) * u.mas / u.yr
+    table['pmra_pmdec_corr'] = np.where(known, spread[:, 0, 1] / np.sqrt(
+        spread[:, 0, 0] * spread[:, 1, 1]), np.nan)
+    table['ref_epoch'] = np.full(len(table), year) * u.yr
+    table.meta['TIMESYS'] = 'TDB'
 
 
 def _read_image(entry):

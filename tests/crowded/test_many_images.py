@@ -114,7 +114,8 @@ def small_tile(x, y, fluxes, frames=WCS_OF[:2], shape=(31, 31)):
                              OPTIONS, (0, 0), None))
         maps.append(TileMap(to_image, grid.to_grid[k], (0, 0), (0, 0)))
     n = len(fluxes)
-    return ManyTile(ManyJob(parts, maps, np.arange(n), np.ones(n), OPTIONS,
+    return ManyTile(ManyJob(parts, maps, np.arange(n), np.ones(n),
+                            np.tile(np.eye(2), (n, 1, 1)), OPTIONS,
                             grid.shape, (0, 0), None, n))
 
 
@@ -168,7 +169,7 @@ def test_covariances_are_those_of_the_dense_problem():
 
 def test_one_step_is_that_of_the_dense_problem():
     tile = small_tile(X, Y, FLUXES)
-    start = FLUXES + [[5.0, -3.0, 2.0], [-4.0, 6.0, 1.0]]
+    start = FLUXES + np.array([[5.0, -3.0, 2.0], [-4.0, 6.0, 1.0]])
     x = X + np.array([0.004, -0.002, 0.001])
     y = Y + np.array([-0.003, 0.002, 0.002])
     tile.start(Stars(x, y, start[0]), start)
@@ -222,7 +223,7 @@ def test_errors_of_fluxes_and_places_are_honest(field, fitted):
     assert 0.8 < 1.48 * np.nanmedian(np.abs(pulls)) < 1.35
     away = sky[true].spherical_offsets_to(SkyCoord(fitted['ra'],
                                                    fitted['dec'])[row])
-    for one, name in zip(away, ('ra_err', 'dec_err'), strict=True):
+    for one, name in zip(away, ('ra_error', 'dec_error'), strict=True):
         pull = (one / fitted[name][row]).to_value(u.one)
         assert 0.8 < 1.48 * np.median(np.abs(pull)) < 1.35
 
@@ -335,3 +336,33 @@ def test_what_cannot_be_images_is_told(field):
             phot.fit_images(images)
     with pytest.raises(ValueError, match='dec'):
         phot.fit_images([(data, psf, wcs)], Table({'x': [1.0]}))
+
+
+def test_motions_of_crowded_stars_are_fitted_with_their_errors():
+    rng = np.random.default_rng(12)
+    places, motion = rng.uniform(3, 60, (2, 80)), rng.normal(0, 0.06, (2, 80))
+    flux = 10**rng.uniform(3, 4.3, 80)
+    images = []
+    for k, year in enumerate((-2.0, 0.0, 2.0)):
+        x, y = WCS_OF[k].world_to_pixel(WCS_OF[0].pixel_to_world(
+            *(places + motion * year)))
+        image = SKY + draw(MIXTURES[k], x, y, flux, (64, 64))
+        data, error = rng.normal(image, np.sqrt(image)), np.sqrt(image)
+        images.append(ImageEpoch(data, PSFS[k], WCS_OF[k], 2028.0 + year,
+                                 error=error))
+    table = CrowdedMixturePhotometry(None).fit_images(images, motions=True)
+    x, y = WCS_OF[0].world_to_pixel(SkyCoord(table['ra'], table['dec']))
+    away, row = cKDTree(np.column_stack([x, y])).query(places.T)
+    good = (away < 0.4) & (flux > 2000)
+    assert good.sum() > 30
+    # A pixel is 72 mas, and columns run against right ascension.
+    for name, true in (('pmra', -72 * motion[0]), ('pmdec', 72 * motion[1])):
+        pull = (table[name][row].value - true) / table[
+            f'{name}_error'][row].value
+        assert 0.7 < 1.48 * np.nanmedian(np.abs(pull[good])) < 1.4
+    assert_allclose(table['ref_epoch'].value, 2028)
+
+
+def test_motions_need_times(field):
+    with pytest.raises(ValueError, match='two times'):
+        CrowdedMixturePhotometry(None).fit_images(field[0], motions=True)
