@@ -214,8 +214,10 @@ def _collect(pool, work, tasks, progress_bar, keep=None):
             errors.append(error)
         outcomes.append(None)
     bar = _bar(len(outcomes)) if progress_bar else None
-    for done, future in enumerate(as_completed(futures), 1):
-        number = futures[future]
+    for future in as_completed(futures):
+        # A cluster would do again what a worker that dies has done for a
+        # future that somebody still holds.
+        number = futures.pop(future)
         try:
             outcomes[number] = future.result()
         except Exception as error:  # noqa: BLE001 a worker may die of any
@@ -223,7 +225,8 @@ def _collect(pool, work, tasks, progress_bar, keep=None):
         else:
             if keep is not None:
                 keep(number, outcomes[number])
-        tell(done, len(outcomes))
+        del future
+        tell(len(outcomes) - len(futures), len(outcomes))
         if bar is not None:
             _advance(bar, outcomes)
     if bar is not None:
