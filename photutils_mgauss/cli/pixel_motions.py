@@ -7,7 +7,10 @@ from photutils_mgauss.cli.observers import check_observer, observer_at
 from photutils_mgauss.cli.progress import Progress
 from photutils_mgauss.cli.results import Results, file_marks
 
-_TABLES = ('motions', 'light_curves', 'images')
+_TABLES = ('motions', 'light_curves', 'images', 'cutouts')
+
+# Stars of both tables that are nearer than this are one.
+_SAME = 0.1 / 3600
 
 
 def add_options(parser):
@@ -149,10 +152,39 @@ def _solve(options, epochs):
 def _made(options, solve, name):
     """Return one of the tables of a solution, and what writes it."""
     solution = solve()
-    table = getattr(solution, {'motions': 'stars', 'light_curves': 'fluxes',
-                               'images': 'images'}[name])
-    return table, partial(tools.write_table, table, record=tools.record_of(
-        options, notes=list(solution.notes)))
+    table = (solution.cutouts() if name == 'cutouts' else
+             getattr(solution, {'motions': 'stars', 'images': 'images',
+                                'light_curves': 'fluxes'}[name]))
+    more = {'notes': list(solution.notes)}
+    if name == 'motions' and options.frames is not None:
+        more['catalogues'] = _gain(options, table)
+    return table, partial(tools.write_table, table,
+                          record=tools.record_of(options, **more))
+
+
+def _gain(options, stars):
+    """Return what catalogues gave of the same exposures, as numbers."""
+    import numpy as np
+    from astropy.coordinates import SkyCoord
+    found = [file for file in Path(options.frames).glob('motions.*')
+             if file.suffix in ('.ecsv', '.fits')]
+    if not found:
+        return {}
+    before = _read_table(found[0])
+    out = {'motions': int(_solved(before).sum())}
+    pairs = [table[_solved(table)] for table in (stars, before)]
+    if not all(len(table) for table in pairs) or 'ra' not in before.colnames:
+        return out
+    places = [SkyCoord(table['ra'], table['dec'], unit='deg')
+              for table in pairs]
+    index, away, _ = places[0].match_to_catalog_sky(places[1])
+    same = away.deg < _SAME
+    out['both'] = int(same.sum())
+    if same.any():
+        for way, errors in (('pixels', _errors(pairs[0])[same]),
+                            ('catalogues', _errors(pairs[1])[index[same]])):
+            out[f'median_error_{way}'] = float(np.median(errors))
+    return out
 
 
 def _read_table(path):
@@ -162,18 +194,23 @@ def _read_table(path):
 
 def _summary(options, stars):
     """Return lines on what came out, and on what catalogues gave."""
+    n = int(_solved(stars).sum())
     lines = [f'{len(stars)} stars at the places given' if options.forced else
-             f'{len(stars)} stars, {_solved(stars)} with proper motions']
-    if options.frames is not None:
-        found = [file for file in Path(options.frames).glob('motions.*')
-                 if file.suffix in ('.ecsv', '.fits')]
-        if found:
-            lines.append(f'catalogues gave {_solved(_read_table(found[0]))}')
+             f'{len(stars)} stars, {n} with proper motions']
+    gain = {} if options.frames is None else _gain(options, stars)
+    if gain:
+        lines.append(f'catalogues gave {gain["motions"]}')
     return lines
 
 
-def _solved(stars):
+def _errors(stars):
+    """Return the errors (n,) of motions along right ascension."""
     import numpy as np
-    error = np.ma.filled(np.ma.asarray(getattr(
+    return np.ma.filled(np.ma.asarray(getattr(
         stars['pmra_error'], 'value', stars['pmra_error'])), np.nan)
-    return int(np.isfinite(error).sum())
+
+
+def _solved(stars):
+    """Return which stars (n,) have motions."""
+    import numpy as np
+    return np.isfinite(_errors(stars))

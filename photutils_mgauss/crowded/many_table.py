@@ -13,8 +13,8 @@ from photutils_mgauss.crowded.table import (
     NO_COVARIANCE,
     NO_FLUX,
     STILL,
-    confusion,
     inside,
+    misfit,
     quality_of,
     significant,
     unlike_a_star,
@@ -53,7 +53,7 @@ def tabulate(tile):
     s, near = tile.stars, tile.neighbours
     quality = [quality_of(model) for model in tile.models]
     place, variance, correlation = tile.equations.covariances()
-    factor = np.array([confusion(one) for one in quality])
+    factor = np.array([misfit(one) for one in quality])
     count, chi2 = (np.array([one[:, i] for one in quality]) for i in (0, 1))
     informed = np.nan_to_num(tile.fluxes**2 / variance)
     place = place * _mean(factor, informed)[:, None, None]

@@ -199,7 +199,8 @@ class ManyTile:
             away = np.maximum(np.maximum(-x, x - nx + 1),
                               np.maximum(-y, y - ny + 1)) > _OUTSIDE
             out.append(Stars(x, y, np.where(away, 0, flux),
-                             seeded=stars.seeded & ~away))
+                             seeded=stars.seeded & ~away,
+                             core=stars.core))
         return out
 
     def start(self, stars, fluxes):

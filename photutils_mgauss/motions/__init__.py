@@ -11,9 +11,11 @@ is known beforehand (`priors`). `loop` solves, judges and rejects until nothing
 changes: a `problem` is solved for all stars and frames at once by `joint` and
 `frames`, `perspective` allows for stars that come nearer, `relative` fixes
 what nothing else does, `chips` are those of cameras, `chip_maps` solves for
-their distortions, `paper_recipe` is the recipe of the paper. `solution`
-is what comes back: its parts are `propagation`, `corrected_epochs`, `tables`,
-`bootstrap`, and `doubts`, what speaks against it. Nothing here knows of pixels
+their distortions, `terms` depend on magnitude, colour and row, `error_scale`
+makes errors right at every magnitude, `paper_recipe` is the recipe of the
+paper. `solution` is what comes back: its parts are `propagation`,
+`corrected_epochs`, `tables`, `bootstrap`, and `doubts`, what speaks against
+it; `membership` says which stars move together. Nothing here knows of pixels
 beyond a position and its covariance.
 """
 from photutils_mgauss.utils.lazy import hand_on

@@ -21,6 +21,8 @@ from scipy.linalg import cho_factor, cho_solve
 from photutils_mgauss.motions.joint import eliminate
 from photutils_mgauss.motions.problem import CHUNK
 
+MOST_NUMBERS = 20_000_000  # in one array of a group of stars
+
 
 @dataclass(frozen=True, eq=False)
 class ChipEquations:
@@ -36,9 +38,13 @@ class ChipEquations:
     rhs: np.ndarray
 
 
-def reduce_chips(problem, distortion, coefficients):
-    """Return the `ChipEquations` of a problem."""
-    n_chips, _, b = coefficients.shape
+def chip_equations(problem, distortion, shape):
+    """
+    Return the `ChipEquations` of stars alone, nothing expected of chips.
+
+    ``shape`` is that of the coefficients (C, 2, b).
+    """
+    n_chips, _, b = shape
     size, frames = 2 * b, problem.n_epochs * 2 * problem.transform.n_terms
     total = ChipEquations(np.zeros((n_chips * size, n_chips * size)),
                           np.zeros((frames, n_chips * size)),
@@ -47,16 +53,43 @@ def reduce_chips(problem, distortion, coefficients):
     # Stars on the same chips stand together, so that groups are slices.
     number = np.where(problem.weights[0] > 0, distortion.number, -1)[:, tying]
     tying = tying[np.lexsort(number)]
-    for start in range(0, len(tying), CHUNK):
-        _add_stars(total, problem, distortion, tying[start:start + CHUNK])
-    known = coefficients.ravel()
-    weight = distortion.sigma**-2
-    common = _common_fields(problem, distortion)
-    firm = np.diag(total.matrix).max(initial=weight)
+    touched = min(n_chips, problem.n_epochs) * size
+    step = int(np.clip(MOST_NUMBERS // (2 * problem.n_epochs * touched), 64,
+                       CHUNK))
+    for start in range(0, len(tying), step):
+        _add_stars(total, problem, distortion, tying[start:start + step])
+    return total
+
+
+def prior_weights(distortion):
+    """Return what is expected of coefficients as inverse variances (M,)."""
+    shape = distortion.none().shape
+    return np.broadcast_to(np.asarray(distortion.sigma)**-2.0, shape).ravel()
+
+
+def reduce_chips(problem, distortion, coefficients):
+    """Return the `ChipEquations` of a problem."""
+    total = chip_equations(problem, distortion, coefficients.shape)
+    known, weight = coefficients.ravel(), prior_weights(distortion)
+    firm = np.diag(total.matrix).max(initial=weight.min())
     total.matrix[np.diag_indices(len(known))] += weight
-    total.matrix[:] += firm * common @ common.T
-    return replace(total, rhs=total.rhs - weight * known
-                   - firm * common @ (common.T @ known))
+    rhs = total.rhs - weight * known
+    if distortion.has_maps:
+        common = _common_fields(problem, distortion)
+        total.matrix[:] += firm * common @ common.T
+        rhs -= firm * common @ (common.T @ known)
+    return replace(total, rhs=rhs)
+
+
+def chip_covariance(chips, factor):
+    """
+    Return the covariance (M, M) of the coefficients, frames' included.
+
+    ``factor`` is that of the frames' covariance.
+    """
+    own = np.linalg.inv(chips.matrix)
+    through = own @ chips.cross.T @ factor
+    return own + through @ through.T
 
 
 def _common_fields(problem, distortion):

@@ -83,7 +83,7 @@ class Distortion:
         d(plane)/d(pixel); 0 where there is no chip.
     transforms : list of `~photutils_mgauss.sky.transforms.Transform`
         The scaled pixel coordinates of each chip.
-    sigma : float
+    sigma : float or (2, b) `~numpy.ndarray`
         What is expected of a coefficient [pix].
     """
 
@@ -93,6 +93,9 @@ class Distortion:
     jacobian: np.ndarray
     transforms: list
     sigma: float
+
+    # Whether the map of an exposure can be written as such polynomials.
+    has_maps = True
 
     def none(self):
         """Return the coefficients (C, 2, b) [pix] of no distortion."""

@@ -87,7 +87,7 @@ def _correct_chips(epoch, correction, result, rows):
 def _through_chip(wcs, name, correction, result, x, y):
     """Return corrected directions (3, n) of pixels of a chip."""
     distortion = result.setup.distortion
-    if distortion is not None:
+    if distortion is not None and distortion.has_maps:
         x, y = distortion.pixels(result.state.distortion, name, x, y)
     return correction(pixel_to_vectors(wcs, x, y, bounded=False))
 

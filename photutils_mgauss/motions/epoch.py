@@ -426,6 +426,15 @@ def brightness(table):
     return values
 
 
+def magnitudes(table):
+    """Return magnitudes (n,), from fluxes if need be, NaN where unknown."""
+    values = brightness(table)
+    if find_column(table, names_of('flux')) is None:
+        return -values
+    with np.errstate(invalid='ignore', divide='ignore'):
+        return np.where(values > 0, -2.5 * np.log10(values), np.nan)
+
+
 def pixels(epoch):
     """Return x and y [pix] of an epoch."""
     return numbers(epoch.table, 'x', u.pix), numbers(epoch.table, 'y', u.pix)

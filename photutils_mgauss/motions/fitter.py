@@ -13,6 +13,7 @@ from photutils_mgauss.motions.matching import HowToMatch
 from photutils_mgauss.motions.paper_recipe import fit_paper
 from photutils_mgauss.motions.prepare import Options, prepare
 from photutils_mgauss.motions.solution import solution_of
+from photutils_mgauss.motions.terms import FUNCTIONS
 from photutils_mgauss.sky.observers import julian_years
 from photutils_mgauss.sky.transforms import Transform
 from photutils_mgauss.utils.validation import as_choice, as_real
@@ -51,10 +52,13 @@ class ProperMotionFitter:
         makes all motions relative to the mean of the stars.
     ref_epoch : `~astropy.time.Time` or float, optional
         Epoch of the positions; the default is the mean time of the epochs.
-    systematic : {'fit', None} or `~astropy.units.Quantity`, optional
+    systematic : {'fit', 'magnitude', None} or Quantity, optional
         Error added in quadrature to each axis of every detection of an
         epoch: found from the scatter of the references, none, or given (one
-        value, or one for each epoch).
+        value, or one for each epoch). 'magnitude' also multiplies the errors
+        of each epoch by a smooth function of the magnitude, found from the
+        scatter of all stars: for lists whose errors are too small for some
+        stars and too large for others.
     executor : `~concurrent.futures.Executor`, optional
         Where the work is done; the default is threads on all processors.
     match_by : {'auto', 'id', 'sky', 'pattern'}, optional
@@ -88,6 +92,13 @@ class ProperMotionFitter:
         same in all exposures: 'affine', 'poly-n', or None for nothing.
     distortion_prior : `~astropy.units.Quantity`, optional
         How large each term of it may be at the edge of a chip.
+    terms : str or sequence of str, optional
+        What detections of an epoch may be displaced by: 'magnitude' and
+        'colour' (columns ``colour``, ``color`` or ``bp_rp``), smooth
+        functions of these, and 'y', along the rows of the detector, in
+        proportion to the row and a function of magnitude, as imperfect
+        charge transfer does it. Those that cross-validation does not confirm
+        are left out; see `MotionSolution.terms`.
 
     Examples
     --------
@@ -117,7 +128,7 @@ class ProperMotionFitter:
                  match_radius=None, max_motion=50 * u.mas / u.yr, clip=5.0,
                  hold_out=0.0, parallax_prior=(0.5, 0.5) * u.mas,
                  acceleration=False, eps_t='printed', rng=None,
-                 distortion='affine', distortion_prior=2 * u.arcsec):
+                 distortion='affine', distortion_prior=2 * u.arcsec, terms=()):
         self.transform = transform
         self.parallax = parallax
         self.recipe = recipe
@@ -136,6 +147,7 @@ class ProperMotionFitter:
         self.rng = rng
         self.distortion = distortion
         self.distortion_prior = distortion_prior
+        self.terms = terms
         self._options()
         self._how_to_match()
 
@@ -206,7 +218,8 @@ class ProperMotionFitter:
                        _systematic(self.systematic), clip, self.max_motion,
                        held, self.eps_t, self.rng, self.executor,
                        _distortion(self.distortion), _check_quantity(
-                           self.distortion_prior, 'distortion_prior', u.mas))
+                           self.distortion_prior, 'distortion_prior', u.mas),
+                       _terms(self.terms))
 
 
 def _check_quantity(value, name, *units):
@@ -230,9 +243,17 @@ def _distortion(value):
     return kind
 
 
+def _terms(value):
+    """Return the kinds of terms as a tuple, in one order."""
+    kinds = [value] if isinstance(value, str) else list(value or ())
+    for kind in kinds:
+        as_choice(kind, 'terms', tuple(FUNCTIONS))
+    return tuple(kind for kind in FUNCTIONS if kind in kinds)
+
+
 def _systematic(value):
     if value is None:
         return None
     if isinstance(value, str):
-        return as_choice(value, 'systematic', ('fit',))
+        return as_choice(value, 'systematic', ('fit', 'magnitude'))
     return _check_quantity(value, 'systematic', u.mas, u.pix)

@@ -2,9 +2,15 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from astropy.table import QTable
 from scipy.special import chdtri, ndtr
 
-from photutils_mgauss.motions.chip_maps import reduce_chips, without_chips
+from photutils_mgauss.motions.chip_maps import (
+    chip_covariance,
+    reduce_chips,
+    without_chips,
+)
+from photutils_mgauss.motions.error_scale import fit_error_scales
 from photutils_mgauss.motions.frames import (
     Frames,
     fixed_frames,
@@ -23,7 +29,12 @@ from photutils_mgauss.motions.prepare import Setup, State
 from photutils_mgauss.motions.priors import weak_priors
 from photutils_mgauss.motions.problem import MotionProblem
 from photutils_mgauss.motions.relative import remove_mean_fields
-from photutils_mgauss.motions.stacked import dimensions_2x2, invert_2x2
+from photutils_mgauss.motions.stacked import (
+    dimensions_2x2,
+    invert_2x2,
+    variance_2x2,
+)
+from photutils_mgauss.motions.terms import Terms, chosen_terms, terms_table
 
 CONVERGED = 1e-3  # of the median error of a detection
 MAX_ITERATIONS = 40
@@ -113,6 +124,9 @@ def measured(setup, state, e):
     """Return the covariances (3, n) of an epoch with its floor."""
     floor = np.broadcast_to(state.floor.T, (2, len(state.maps)))[:, e]
     xx, xy, yy = setup.sightings.covariance[:, e]
+    if state.scales is not None:
+        xx, xy, yy = state.factor[e] * setup.sightings.covariance[:, e]
+        floor = state.added[[e, e]]
     return np.stack([xx + floor[0], xy, yy + floor[1]])
 
 
@@ -176,6 +190,37 @@ def _align(setup, state):
 
 def fit(setup, state):
     """Return the `Fit` of a setup: align, reject, estimate the floors."""
+    if setup.terms is not None:
+        setup, state = _with_terms(setup, state)
+    problem, frames, state = _cleaned(setup, state)
+    rounds = 12 if setup.options.scales_errors else 4
+    for i in range(rounds * setup.options.fits_floor):
+        after = _systematics(setup, state, problem, frames, anew=i == 0)
+        still = not _moved(setup, state, after, 0.02)
+        problem, frames, state = _align(setup, after)
+        if still:
+            break
+    estimates = solve(setup, problem, frames, residuals=True)
+    if setup.relative and setup.transform.kind != 'none':
+        estimates, common = remove_mean_fields(problem, frames, estimates,
+                                               setup.options)
+        state = replace(state, maps=state.maps - common)
+    return finished(setup, state, problem, frames, estimates)
+
+
+def _with_terms(setup, state):
+    """Return setup and state with the terms that are real, to begin with."""
+    problem, _, after = _cleaned(setup, state)
+    kinds = chosen_terms(problem, setup.terms, setup.options.executor)
+    if not kinds:
+        return replace(setup, terms=None), state
+    terms = setup.terms.only(kinds)
+    return replace(setup, terms=None, distortion=terms), replace(
+        state, maps=after.maps, floor=after.floor, distortion=terms.none())
+
+
+def _cleaned(setup, state):
+    """Return problem, frames and state with all outliers rejected."""
     for _ in range(MAX_ITERATIONS):
         problem, frames, state = _align(setup, state)
         if setup.options.clip is None:
@@ -185,20 +230,19 @@ def fit(setup, state):
             break
     else:
         state = replace(state, unfinished=True)
-    for _ in range(4 * setup.options.fits_floor):
-        floor = _floors(setup, state, problem, frames)
-        still = np.allclose(floor, state.floor, rtol=0.02,
-                            atol=1e-3 * setup.typical_variance)
-        state = replace(state, floor=floor)
-        problem, frames, state = _align(setup, state)
-        if still:
-            break
-    estimates = solve(setup, problem, frames, residuals=True)
-    if setup.relative and setup.transform.kind != 'none':
-        estimates, common = remove_mean_fields(problem, frames, estimates,
-                                               setup.options)
-        state = replace(state, maps=state.maps - common)
-    return finished(setup, state, problem, frames, estimates)
+    return problem, frames, state
+
+
+def fitted_terms(result):
+    """Return the table of the terms of a `Fit`."""
+    setup, terms = result.setup, result.setup.distortion
+    if not isinstance(terms, Terms):
+        return QTable(names=('epoch', 'term', 'dx', 'dy'),
+                      dtype=(int, 'U9', float, float))
+    coefficients = result.state.distortion
+    chips = reduce_chips(result.problem, terms, coefficients)
+    return terms_table(terms, coefficients, chip_covariance(
+        chips, result.frames.factor), setup.sightings.epoch_years)
 
 
 def measured_alone(result):
@@ -220,13 +264,11 @@ def solve(setup, problem, frames, **wanted):
 def _review(setup, state, problem, frames):
     """Return the state without outliers, and whether anything changed."""
     if setup.options.fits_floor:
-        floor = _floors(setup, state, problem, frames, robust=True)
-        moved = np.abs(floor - state.floor) > (
-            0.1 * state.floor + 0.01 * setup.typical_variance)
-        if moved.any():
+        after = _systematics(setup, state, problem, frames, robust=True)
+        if _moved(setup, state, after, 0.1):
             # Residuals are judged once the floors are right: a floor that
             # is too small would make outliers of all bright stars.
-            return replace(state, floor=floor), True
+            return after, True
     dropped = _discrepant(setup, problem, frames)
     if len(dropped):
         return replace(state, dropped=np.union1d(state.dropped,
@@ -332,21 +374,48 @@ def _barely_known(setup, problem, frames, which):
     return solve(setup, weak, frames, residuals=True).total, missing
 
 
-def _floors(setup, state, problem, frames, *, robust=False):
-    """Return the floor variances (E,) from the references' residuals."""
-    stars = np.flatnonzero(problem.ties & setup.anchors
+def _moved(setup, state, after, part):
+    """Return whether errors have changed by more than a part of them."""
+    if after.scales is None:
+        return (np.abs(after.floor - state.floor) > part * state.floor + (
+            part / 10) * setup.typical_variance).any()
+    used = state.used
+    change = [np.log(variance_2x2(measured(setup, after, e)[:, used[e]])
+                     / variance_2x2(measured(setup, state, e)[:, used[e]]))
+              for e in range(len(used)) if used[e].any()]
+    return np.abs(np.concatenate(change)).mean() > part / 2
+
+
+def _systematics(setup, state, problem, frames, *, robust=False,
+                 anew=False):
+    """
+    Return the state with the errors that residuals say.
+
+    Those of the references, or for functions of magnitude of all stars.
+    With ``anew`` the number of nodes of these is chosen again.
+    """
+    anchors = setup.anchors | setup.options.scales_errors
+    stars = np.flatnonzero(problem.ties & anchors
                            & ~np.isin(np.arange(problem.n_stars),
                                       state.dropped))
     if not len(stars):
-        return state.floor
+        return state
     estimates = solve(setup, problem.select(stars), frames, residuals=True,
                       judge=True)
     covariance = setup.sightings.covariance[..., stars]
-    used = state.used[:, stars]
-    return np.array([floor_variance(
-        np.where(used[e], estimates.residuals[:, e], np.nan),
-        covariance[:, e], estimates.expected[e], state.floor[e],
-        robust=robust) for e in range(len(state.floor))])
+    residuals = np.where(state.used[:, stars], estimates.residuals, np.nan)
+    epochs = range(len(state.maps))
+    if not setup.options.scales_errors:
+        return replace(state, floor=np.array([floor_variance(
+            residuals[:, e], covariance[:, e], estimates.expected[e],
+            state.floor[e], robust=robust) for e in epochs]))
+    scales = fit_error_scales(
+        setup.magnitudes[:, stars], residuals, covariance,
+        estimates.expected, robust=robust,
+        like=None if anew else state.scales)
+    factor, added = scales.at(setup.magnitudes)
+    return replace(state, scales=scales, factor=factor, added=added,
+                   floor=np.median(added, axis=1))
 
 
 def chi2_limit(clip, dof):

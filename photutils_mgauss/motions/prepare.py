@@ -1,4 +1,5 @@
 """All that stays the same while a fit of motions iterates, made once."""
+import warnings
 from dataclasses import dataclass
 
 import astropy.units as u
@@ -6,7 +7,8 @@ import numpy as np
 
 from photutils_mgauss.motions.assemble import Sightings
 from photutils_mgauss.motions.chips import Distortion, distortion_of
-from photutils_mgauss.motions.epoch import pixels
+from photutils_mgauss.motions.epoch import magnitudes, pixels
+from photutils_mgauss.motions.error_scale import ErrorScales
 from photutils_mgauss.motions.perspective import Nearing
 from photutils_mgauss.motions.priors import (
     Priors,
@@ -14,6 +16,7 @@ from photutils_mgauss.motions.priors import (
     build_priors,
 )
 from photutils_mgauss.motions.stacked import variance_2x2
+from photutils_mgauss.motions.terms import Terms, terms_of
 from photutils_mgauss.sky.transforms import Transform
 from photutils_mgauss.utils.validation import as_rng
 
@@ -36,6 +39,7 @@ class Options:
     executor: object
     distortion: Transform
     distortion_prior: u.Quantity
+    terms: tuple
 
     @property
     def n_star_parameters(self):
@@ -46,6 +50,11 @@ class Options:
     def fits_floor(self):
         """Whether the systematic errors are found from the scatter."""
         return isinstance(self.systematic, str)
+
+    @property
+    def scales_errors(self):
+        """Whether errors are scaled, too, as functions of magnitude."""
+        return self.fits_floor and self.systematic == 'magnitude'
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +94,12 @@ class Setup:
         What could not be used, in sentences.
     typical_variance : float
         Median variance of the detections, 1 if there are none.
+    magnitudes : (E, n) `~numpy.ndarray` or None
+        Of the detections, if something depends on them.
     distortion : `~photutils_mgauss.motions.chips.Distortion` or None
-        Of the chips of cameras, if there are any.
+        Of the chips of cameras, if there are any, or the terms in use.
+    terms : `~photutils_mgauss.motions.terms.Terms` or None
+        Those asked for, until it is known which are real.
     """
 
     sightings: Sightings
@@ -104,7 +117,9 @@ class Setup:
     nearing: Nearing
     notes: tuple
     typical_variance: float
+    magnitudes: np.ndarray | None
     distortion: Distortion | None
+    terms: Terms | None
 
     def undistorted(self, state):
         """Return the places (2, E, n) with the distortion of chips gone."""
@@ -125,7 +140,10 @@ class State:
     ``swerve`` (2, E, k) what stars of known radial velocity move beyond the
     model, ``crooked`` (n,) stars that no straight motion explains, whose
     detections are all kept, ``unfinished`` whether there may be outliers
-    left, ``distortion`` (C, 2, b) the polynomials of chips [pix], if any.
+    left, ``distortion`` (C, 2, b) the polynomials of chips [pix], if any,
+    ``scales`` the `~photutils_mgauss.motions.error_scale.ErrorScales` of the
+    epochs, ``factor`` (E, n) what they multiply covariances by and ``added``
+    (E, n) the variances they add, if they are fitted.
     """
 
     maps: np.ndarray
@@ -137,6 +155,9 @@ class State:
     crooked: np.ndarray
     unfinished: bool = False
     distortion: np.ndarray | None = None
+    scales: ErrorScales | None = None
+    factor: np.ndarray | None = None
+    added: np.ndarray | None = None
 
 
 def prepare(sightings, options):
@@ -165,16 +186,58 @@ def prepare(sightings, options):
                                     options.parallax_prior)
     variance = variance_2x2(sightings.covariance[:, sightings.usable])
     maps = np.repeat(transform.identity()[None], len(dt), axis=0)
+    brightness = (magnitudes_of(sightings)
+                  if options.scales_errors or options.terms else None)
+    typical = np.median(variance) if variance.size else 1.0
     distortion = distortion_of(sightings, pixels, options.distortion,
                                options.distortion_prior.to_value(u.mas))
+    terms = _terms(sightings, options, brightness, distortion, typical)
     return (Setup(sightings, options, transform, origin, working, dt, priors,
                   places, anchors, held, relative, drift, nearing, notes,
-                  np.median(variance) if variance.size else 1.0, distortion),
+                  typical, brightness, distortion, terms),
             State(maps, sightings.usable.copy(), floor,
                   np.empty(0, dtype=int), untied,
                   np.zeros((2, len(dt), len(nearing.stars))),
                   np.zeros(len(anchors), dtype=bool),
                   distortion=distortion and distortion.none()))
+
+
+def _terms(sightings, options, brightness, distortion, typical):
+    """Return the `Terms` asked for, None if there are none."""
+    if not options.terms:
+        return None
+    if distortion is not None:
+        msg = ('distortion must be None for terms of epochs of chips, got '
+               f'{options.distortion.kind!r}: one fit finds either of them')
+        raise ValueError(msg)
+    if options.transform.kind == 'none' or options.recipe == 'paper':
+        msg = ('terms need maps between the epochs: give a transform, and '
+               "the recipe 'joint' or 'two-step'")
+        raise ValueError(msg)
+    return terms_of(sightings, options.terms, brightness, np.sqrt(typical))
+
+
+def magnitudes_of(sightings):
+    """
+    Return the magnitudes (E, n) of detections, in the mean system.
+
+    Where an epoch has none, it is that of the others.
+    """
+    each = sightings.matches.take([magnitudes(epoch.table)
+                                   for epoch in sightings.epochs])
+    if not np.isfinite(each).any():
+        msg = ('epochs must have a column of magnitudes or fluxes (mag or '
+               "flux_fit) for systematic='magnitude' and terms, got none")
+        raise ValueError(msg)
+    with warnings.catch_warnings():
+        # Stars without a magnitude.
+        warnings.simplefilter('ignore', RuntimeWarning)
+        zero = np.zeros((len(each), 1))
+        for _ in range(3):
+            mean = np.nanmedian(each - zero, axis=0)
+            zero = np.nan_to_num(np.nanmedian(each - mean, axis=1))[:, None]
+    each -= zero - zero.mean()
+    return np.where(np.isfinite(each), each, mean + zero.mean())
 
 
 def _check_options(options, sightings):

@@ -20,31 +20,22 @@ eliminated. Groups of m neighbours are fitted together: v is that of all.
 Arrays have the g groups first: (g, m, p) parameters, (g, E, m) of E images.
 """
 from dataclasses import dataclass, fields
-from functools import cache
 
 import numpy as np
-from scipy.special import ndtri
-from scipy.stats import qmc
 
 from photutils_mgauss import kernels
 from photutils_mgauss.photometry.engine import cut_boxes
 
 _MAX_STEPS = 60
 
-# Of the next step [pix], as for single images, or in standard errors.
+# Of the next step [pix], as for single images.
 TOLERANCE = 1e-6
-_SMALL = 1e-10
 
 # Of the data, what chi2 may rise by for nothing.
 _ROUNDING = 1e-14
 
 # Where no longer step lowers chi2 either, a small one is the last.
 _HOPELESS = 1e8
-
-# How many points a likelihood is sampled at, and how much wider they lie than
-# the Gaussian of its peak.
-_SAMPLES = 128
-_WIDE = 1.5
 
 # The least eigenvalue of a matrix of unit diagonal that says enough.
 _SINGULAR = 1e-11
@@ -242,6 +233,8 @@ class JointFit:
         Which parameters are fitted.
     own : (g, E, m, 3) `~numpy.ndarray` or None
         Light of the stars that the images are without.
+    least_gain : float
+        A step that promises to lower chi2 by less is the last.
     """
 
     joint: JointImages
@@ -249,17 +242,21 @@ class JointFit:
     boxes: np.ndarray
     free: np.ndarray
     own: np.ndarray | None = None
+    least_gain: float = 1e-10
 
     def evaluate(self, values, rows):
         """Return the `State` of some groups (r,) at values (r, m, p)."""
-        views = self.views
-        places = views.places(values, rows)
+        return _state(self.joint, values, self.views.slopes[rows],
+                      self._moments(values, rows))
+
+    def _moments(self, values, rows):
+        """Return the `Moments` of some groups (r,) at values (r, m, p)."""
+        places = self.views.places(values, rows)
         boxes = self.boxes[rows]
         seen = boxes[..., 2:].all(axis=-1)
         places = np.where(seen[..., None], places, 0.0)
-        moments = Moments.of(self.joint, boxes, places,
-                             None if self.own is None else self.own[rows])
-        return _state(self.joint, values, views.slopes[rows], moments)
+        return Moments.of(self.joint, boxes, places,
+                          None if self.own is None else self.own[rows])
 
     def minimize(self):
         """Return the `State` at the least chi2, and who converged (g,)."""
@@ -294,47 +291,21 @@ class JointFit:
         length = np.abs(shift).max(axis=(1, 2, 3))
         # No star moves farther than a pixel at a time.
         step *= np.minimum(1, 1 / np.maximum(length, 1e-300))[:, None]
-        return step, (length < TOLERANCE) | (promised < _SMALL)
+        return step, (length < TOLERANCE) | (
+            promised < self.least_gain)
 
-    def spread(self, state, faint):
-        r"""
-        Return the mean squares (g, p, p) of the likelihood about its peak.
-
-        Where the signal is low the likelihood is not a Gaussian. It is
-        sampled at points :math:`v + L z` of a wider Gaussian, weighted by
-        what it is there; NaN where ``faint`` (g,) does not ask for it. Only
-        for single stars.
+    def scores(self, values, rows):
         """
-        n, _, p = state.values.shape
-        out = np.full((n, p, p), np.nan)
-        rows = np.flatnonzero(faint)
-        if not rows.size:
-            return out
-        now = state.take(rows)
-        inverses, _ = fixed_inverse(now.matrix, self.free[rows, 0])
-        values, vectors = np.linalg.eigh(inverses)
-        root = vectors * np.sqrt(np.maximum(values, 0))[:, None, :]
-        points = _points(p)
-        steps = _WIDE * np.einsum('nij,sj->sni', root, points)
-        weight = np.stack([self._likelihood(now, step, rows)
-                           for step in steps])
-        weight += 0.5 * np.sum(points**2, axis=1)[:, None]
-        weight = np.exp(weight - weight.max(axis=0))
-        out[rows] = np.einsum('sn,sni,snj->nij', weight / weight.sum(axis=0),
-                              steps, steps, optimize=True)
-        return out
+        Return products of fluxes at places: with the data, with themselves.
 
-    def _likelihood(self, state, step, rows):
-        """Return the logarithm of the likelihood a step from the peak."""
-        there = self.evaluate(state.values + step[:, None], rows)
-        return (state.chi2 - there.chi2) / 2
-
-
-@cache
-def _points(size):
-    """Return evenly spread points (s, size) of a Gaussian."""
-    uniform = qmc.Sobol(size, rng=np.random.default_rng(1)).random(_SAMPLES)
-    return ndtri(uniform)
+        Only for single stars; (r, C) each.
+        """
+        moments = self._moments(values, rows)
+        light, weight = np.zeros((2, len(rows), self.joint.n_fluxes))
+        for k, c in enumerate(self.joint.shared):
+            light[:, c] += moments.data[:, k, 0]
+            weight[:, c] += moments.products[:, k, 0, 0]
+        return light, weight
 
 
 def boxes_around(pixels, fit_shape, shapes):

@@ -79,6 +79,13 @@ class Campaign:
         return [epoch.pixels.shape for epoch in self.epochs]
 
     @property
+    def bands(self):
+        """The number, from 0, of the band of each flux."""
+        bands = [epoch.band or '' for epoch in self.epochs]
+        _, first = np.unique(self.joint.shared, return_index=True)
+        return np.unique(np.array(bands)[first], return_inverse=True)[1]
+
+    @property
     def notes(self):
         """What is to be said about the images, in sentences."""
         notes = []

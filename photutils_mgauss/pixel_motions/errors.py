@@ -14,11 +14,12 @@ for the place makes fluxes too large, too, by
 .. math:: \frac{\Delta f}{f} = \frac{1}{2 D} \sum_k \mathrm{tr}
     (G_k J_k S^{-1} J_k^T).
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from photutils_mgauss.photometry.joint_pixels import fixed_inverse
+from photutils_mgauss.psf.star_errors import StarPixels, known_errors
 
 # The least that A may be of S: below, the fit is no longer near its truth.
 _LEAST = 0.3
@@ -116,7 +117,7 @@ def _bias(campaign, solved, rows, covariance):
     return np.minimum(out, 0.5)
 
 
-def frame_covariance(solution, campaign, solved, plain):
+def frame_covariance(solution, campaign, solved, plain, refined=None):
     r"""
     Return what the errors of frames add to covariances, (p, p, n).
 
@@ -129,25 +130,77 @@ def frame_covariance(solution, campaign, solved, plain):
         The frames are those of the WCS of the images.
     campaign, solved, plain
         The images, the stars, and the inverses of their matrices.
+    refined : `~photutils_mgauss.pixel_motions.refine.Frames`, optional
+        Where the pixels have given frames, what is left are those errors
+        that all stars follow, as a map of the plane.
     """
     fit = solution._fit
     epochs = _epochs_of(solution, campaign)
     frames, transform = fit.frames, fit.setup.transform
-    n, p = solved.values.shape
     size = frames.factor.shape[1]
     factor = frames.factor.reshape(len(solution.epochs), 2, -1, size)
     place = fit.setup.sightings.plane.project(
         campaign.plane.deproject(solved.values[:, :2].T))
-    basis = transform.basis(place)
-    total = np.zeros((n, p, size))
+    basis = np.nan_to_num(transform.basis(place))
+    total = 0.0
     for k, e in enumerate(epochs):
-        weight = solved.curves[:, k] * solved.fluxes[:, k, None, None]**2
-        slope = solved.slopes[:, k]
-        pull = np.einsum('nip,nij,njx->npx', slope, weight, slope[..., :2])
-        moved = np.einsum('xbq,bn->nxq', factor[e], np.nan_to_num(basis))
-        total += pull @ moved
-    total = plain @ total
+        moved = np.einsum('xbq,bn->nxq', factor[e], basis)
+        total += _answers(solved, plain, k, np.einsum(
+            'nix,nxq->niq', solved.slopes[:, k, :, :2], moved))
+    if refined is not None:
+        total = refined.smooth(solved, total)
     return np.einsum('npq,nrq->prn', total, total)
+
+
+def _answers(solved, plain, k, moved):
+    """Return what places (n, 2, q) [pix] in image k do to stars (n, p, q)."""
+    weight = solved.curves[:, k] * solved.fluxes[:, k, None, None]**2
+    return plain @ (solved.slopes[:, k].transpose(0, 2, 1) @ weight @ moved)
+
+
+def with_psf_errors(campaign, solved, errors, fit_shape, executor):
+    """
+    Return errors to which those of the PSFs have been added.
+
+    PSFs that do not know their errors count as exact. The errors of one PSF
+    are those of all images that have it.
+
+    Parameters
+    ----------
+    campaign, solved, errors
+        The images, the stars, and their `Errors`.
+    fit_shape : (int, int)
+    executor : `~concurrent.futures.Executor` or None
+    """
+    owners = {}
+    for k, epoch in enumerate(campaign.epochs):
+        known = known_errors(epoch.model)
+        if known is not None and known.changes.size:
+            owners.setdefault(id(known), []).append(k)
+    covariance, variance = errors.covariance.copy(), errors.flux_error**2
+    for images in owners.values():
+        total = 0.0
+        for k in images:
+            shift = _psf_shifts(campaign, solved, k, fit_shape, executor)
+            total += _answers(solved, errors.plain, k, shift[:, 1:])
+            variance[:, k] += np.sum(shift[:, 0]**2, axis=1) * (
+                solved.fluxes[:, k]**2)
+        covariance += np.einsum('npq,nrq->prn', total, total)
+    return replace(errors, covariance=covariance, flux_error=np.sqrt(variance))
+
+
+def _psf_shifts(campaign, solved, k, fit_shape, executor):
+    """Return relative fluxes, x and y (n, 3, R) that changes of a PSF give."""
+    model = campaign.epochs[k].model
+    seen = np.flatnonzero(solved.weights[:, k] > 0)
+    values = np.column_stack([solved.fluxes[seen, k], solved.pixels[seen, k]])
+    known = known_errors(model)
+    out = np.zeros((len(solved.values), 3, known.changes.shape[1]))
+    out[seen] = np.nan_to_num(StarPixels(
+        campaign.original[k], known, values, fit_shape,
+        fit_sky=campaign.joint.fit_sky,
+        integrated=model.pixel_integrated).shifts(executor))
+    return out
 
 
 def _epochs_of(solution, campaign):

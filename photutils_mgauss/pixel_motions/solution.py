@@ -7,13 +7,15 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from photutils_mgauss.pixel_motions.campaign import Campaign
+from photutils_mgauss.pixel_motions.cutouts import cutout_table
 from photutils_mgauss.pixel_motions.errors import Errors
 from photutils_mgauss.pixel_motions.solve import Solved
 from photutils_mgauss.pixel_motions.stars import StarList
-from photutils_mgauss.pixel_motions.tables import flux_table
+from photutils_mgauss.pixel_motions.tables import RELATIVE, flux_table
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.sky.observers import tdb
 from photutils_mgauss.utils.notebook import with_table
+from photutils_mgauss.utils.validation import as_shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,8 @@ class PixelMotionSolution:
     <PixelMotionSolution: 8 of 8 stars, 3 images>
     >>> solution.stars['flux'].shape
     (8, 3)
+    >>> solution.cutouts(size=15)['residual'].shape
+    (3, 15, 15)
     >>> solution.fluxes['id', 'image', 'flux', 'flux_err'].colnames
     ['id', 'image', 'flux', 'flux_err']
     """
@@ -104,12 +108,70 @@ class PixelMotionSolution:
                           self._errors)
 
     @property
+    def wcs(self):
+        """The WCS of all images, corrected if frames were refined."""
+        return self._campaign.frames
+
+    @property
     def sky(self):
         """The stars as a `~astropy.coordinates.SkyCoord` with motions."""
         return SkyCoord(self.stars['ra'], self.stars['dec'],
                         pm_ra_cosdec=self.stars['pmra'],
                         pm_dec=self.stars['pmdec'], frame='icrs',
                         obstime=tdb(self.stars['ref_epoch'][0].value))
+
+    def cutouts(self, star=None, *, size=15):
+        """
+        Return what each image shows of one star.
+
+        Parameters
+        ----------
+        star : optional
+            Its ``id``; by default that of the star of the least
+            ``significance`` without a flag, other than that motions are
+            relative.
+        size : int or (ny, nx) tuple of int, optional
+            Of the stamps.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            One row for each image that shows it: ``image``, ``time``, ``x``,
+            ``y``, and (ny, nx) stamps with the star in the middle pixel:
+            ``data`` less the sky, ``model`` of all stars and ``residual``.
+            NaN where there is no pixel. Its ``meta`` has the ``ID`` and the
+            ``SIGNIF`` of the star. Without any star there are no rows.
+
+        Raises
+        ------
+        ValueError
+            If there is no such star, or the size is not valid.
+
+        """
+        size = as_shape(size, 'size')
+        if star is None and not self._measured.any():
+            return QTable(names=('image', 'time', 'x', 'y', 'data', 'model',
+                                 'residual'))
+        row = self._row_of(star)
+        table = cutout_table(self._campaign, self._solved, row, size)
+        table.meta['ID'] = np.asarray(self.stars['id'])[row].item()
+        table.meta['SIGNIF'] = float(self.stars['significance'][row])
+        return table
+
+    @property
+    def _measured(self):
+        """Whether nothing speaks against each star (n,)."""
+        return (np.asarray(self.stars['flags']) & ~RELATIVE) == 0
+
+    def _row_of(self, star):
+        if star is None:
+            signal = np.asarray(self.stars['significance'])
+            return int(np.argmin(np.where(self._measured, signal, np.inf)))
+        found = np.flatnonzero(np.asarray(self.stars['id']) == star)
+        if not found.size:
+            msg = f'star must be the id of one of the stars, got {star!r:.80}'
+            raise ValueError(msg)
+        return int(found[0])
 
     def model(self, image):
         """

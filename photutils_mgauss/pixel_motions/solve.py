@@ -5,7 +5,7 @@ Stars close to each other are one group, fitted together. Light of all other
 stars is subtracted from the images with the values of the last round, until
 nothing moves any more.
 """
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import numpy as np
@@ -18,7 +18,9 @@ from photutils_mgauss.photometry.joint_pixels import (
     State,
     Views,
     boxes_around,
+    fixed_inverse,
 )
+from photutils_mgauss.pixel_motions.posterior import posterior
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.utils.parallel import map_parallel
 
@@ -35,11 +37,15 @@ _MOST = 6
 _ROUNDS = 8
 _SETTLED = 0.03
 
+# What chi2 a last step may be worth: a thousandth of a standard error.
+_LEAST_GAIN = 1e-6
+
 # The WCS counts as a linear map as far as this [pix].
 _LINEAR = 0.5
 
-# Below this significance the likelihood is sampled for errors.
-_FAINT = 12.0
+# Stars whose place in an image is less sure than this, in units of the PSF's
+# FWHM, are means of their probability.
+_UNSURE = 0.06
 
 # Where a Gaussian of a subtracted star ends, in units of the noise.
 _FAINTEST = 1e-3
@@ -69,7 +75,7 @@ class Solved:
     excess : (n, E) `~numpy.ndarray`
         Products of the PSF with what is left of the data.
     spread : (n, p, p) `~numpy.ndarray`
-        Mean squares of the likelihood about its peak; NaN if not sampled.
+        Mean squares of the probability of faint stars; NaN for the others.
     groups, states : list
         The stars (g, m) of groups of each size, and their
         `~photutils_mgauss.photometry.joint_pixels.State`.
@@ -94,12 +100,14 @@ class Solved:
     states: list
 
 
-def solve(campaign, values, fit_shape, *, forced, executor, progress_bar):
+def solve(campaign, values, fit_shape, *, reach, forced, executor,
+          progress_bar):
     """
     Fit stars (n, p) to all images; return their `Solved`.
 
-    Stars whose place is not finite, or that no image shows, are left out of
-    the fit and get no pixels.
+    Faint ones stay within ``reach``, in units of the PSF's FWHM; None leaves
+    all at the peaks of their likelihood. Stars whose place is not finite, or
+    that no image shows, are left out of the fit and get no pixels.
     """
     pixels = campaign.views(values[:, None]).pixels[:, :, 0]
     groups = _groups(campaign, pixels)
@@ -107,8 +115,10 @@ def solve(campaign, values, fit_shape, *, forced, executor, progress_bar):
     fit_all = partial(_fit_all, groups=groups, fit_shape=fit_shape,
                       forced=forced, spread_over=partial(
                           _spread_over, executor, progress_bar))
+    region = (None if forced or reach is None else
+              _Region.of(campaign, values, reach))
     if not near:
-        return fit_all(campaign, values, own=None, sample=True)
+        return fit_all(campaign, values, own=None, region=region)
     own, moved = None, np.inf
     for _ in range(_ROUNDS):
         state = fit_all(campaign, values, own=own)
@@ -117,7 +127,31 @@ def solve(campaign, values, fit_shape, *, forced, executor, progress_bar):
         if own is not None and moved < _SETTLED:
             break
         campaign, own = _subtract(campaign, state)
-    return fit_all(campaign, values, own=own, sample=True)
+    return fit_all(campaign, values, own=own, region=region)
+
+
+@dataclass(frozen=True, eq=False)
+class _Region:
+    """
+    Where faint stars are thought to be.
+
+    Within ``reach`` (E,) [pix] of the places of given values (n, m, p), in
+    images of PSFs of some FWHM (E,). Fluxes of the same number in ``alike``
+    (C,) are those of one band.
+    """
+
+    given: np.ndarray
+    reach: np.ndarray
+    widths: np.ndarray
+    alike: np.ndarray
+
+    @classmethod
+    def of(cls, campaign, values, reach):
+        widths = np.array([fwhm(epoch) for epoch in campaign.epochs])
+        return cls(values, reach * widths, widths, campaign.bands)
+
+    def take(self, rows):
+        return replace(self, given=self.given[rows])
 
 
 def _groups(campaign, pixels):
@@ -176,7 +210,7 @@ def _has_neighbours(pixels, campaign, fit_shape):
 
 
 def _fit_all(campaign, values, *, groups, fit_shape, forced, own, spread_over,
-             sample=False):
+             region=None):
     """Fit all groups once, the WCS taken anew where stars have moved."""
     parts = []
     for group in groups:
@@ -187,7 +221,8 @@ def _fit_all(campaign, values, *, groups, fit_shape, forced, own, spread_over,
             fit = _fit_of(campaign, views, fit_shape, forced,
                           None if own is None else
                           own[group[moving]].transpose(0, 2, 1, 3))
-            got = _minimize(fit, spread_over, sample and not forced)
+            got = _minimize(fit, spread_over, None if region is None else
+                            region.take(group[moving]))
             done = got if done is None else _replaced(done, moving, got)
             at = np.flatnonzero(_shift(got) > _LINEAR)
             if forced or not at.size:
@@ -224,13 +259,14 @@ def _fit_of(campaign, views, fit_shape, forced, own):
                      own), enough.reshape(n, m))
 
 
-def _minimize(fit, spread_over, sample):
+def _minimize(fit, spread_over, region):
     """Return the `_Part` of a fit, in pieces spread over threads."""
     fit, enough = fit
     n, _, m, _ = fit.views.pixels.shape
     size = max(1, _CHUNK // m**2)
-    pieces = [_piece(fit, slice(i, i + size)) for i in range(0, n, size)]
-    results = spread_over(partial(_run, fit.joint, sample), pieces)
+    pieces = [_piece(fit, region, slice(i, i + size))
+              for i in range(0, n, size)]
+    results = spread_over(partial(_run, fit.joint), pieces)
     state = State(*(np.concatenate([getattr(one, f.name)
                                     for one, *_ in results])
                     for f in fields(State)))
@@ -248,22 +284,39 @@ def _spread_over(executor, progress_bar, work, pieces):
                      disable=not progress_bar))
 
 
-def _piece(fit, rows):
+def _piece(fit, region, rows):
     views = Views(*(getattr(fit.views, f.name)[rows] for f in fields(Views)))
-    return (views, fit.boxes[rows], fit.free[rows],
+    return (None if region is None else region.take(rows), views,
+            fit.boxes[rows], fit.free[rows],
             None if fit.own is None else fit.own[rows])
 
 
-def _run(joint, sample, piece):
+def _run(joint, piece):
     """Return the state of a piece, who converged, and the spread."""
-    fit = JointFit(joint, *piece)
+    region, *rest = piece
+    fit = JointFit(joint, *rest, least_gain=_LEAST_GAIN)
     state, done = fit.minimize()
-    size = state.gradient.shape[1]
-    if not sample or size > state.values.shape[2]:
-        return state, done, np.full((len(done), size, size), np.nan)
-    signal = np.einsum('gem,gem->g', state.fluxes[:, joint.shared]**2,
-                       state.weights)
-    return state, done, fit.spread(state, signal < _FAINT**2)
+    n, m, p = state.values.shape
+    spread = np.full((n, p, p), np.nan)
+    faint = np.flatnonzero([] if region is None or m > 1 else
+                           _are_faint(fit, state, region.widths))
+    if faint.size:
+        mean, square, good = posterior(fit, state, faint, region.given[faint],
+                                       region.reach, region.alike)
+        there = fit.evaluate(np.nan_to_num(mean)[:, None], faint)
+        state.put(faint, there, good)
+        spread[faint[good]] = square[good]
+    return state, done, spread
+
+
+def _are_faint(fit, state, widths):
+    """Return whether the places of single stars (g,) are unsure somewhere."""
+    inverses, known = fixed_inverse(state.matrix, fit.free[:, 0])
+    slopes = fit.views.slopes[:, :, 0]
+    variance = np.einsum('neip,npq,neiq->ne', slopes, inverses, slopes,
+                         optimize=True) / 2
+    unsure = (state.n_pixels > 0) & (variance > (_UNSURE * widths)**2)
+    return known.any(axis=1) & unsure.any(axis=1)
 
 
 def _shift(part):

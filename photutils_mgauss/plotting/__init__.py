@@ -21,14 +21,17 @@ from photutils_mgauss.plotting.fit import (
 from photutils_mgauss.plotting.grid import (
     plot_node_map,
     plot_psf_image,
+    plot_radial_profile,
     plot_shape_map,
     plot_whiskers,
     plot_width_map,
     plot_worst_node,
 )
 from photutils_mgauss.plotting.motions import (
+    plot_cutouts,
     plot_errors_by_epochs,
     plot_motion_errors,
+    plot_motions_by_magnitude,
     plot_proper_motions,
     plot_residual_vectors,
 )
@@ -42,6 +45,7 @@ from photutils_mgauss.plotting.stars import (
     plot_comparison,
     plot_detections,
     plot_error_curve,
+    plot_residual_image,
     plot_stated_errors,
 )
 
@@ -49,6 +53,7 @@ __all__ = [
     'plot_comparison',
     'plot_comparison_of_numbers',
     'plot_corner',
+    'plot_cutouts',
     'plot_detections',
     'plot_ellipses',
     'plot_error_curve',
@@ -57,13 +62,16 @@ __all__ = [
     'plot_mixture',
     'plot_model_graph',
     'plot_motion_errors',
+    'plot_motions_by_magnitude',
     'plot_node_map',
     'plot_posterior',
     'plot_profile',
     'plot_projection',
     'plot_proper_motions',
     'plot_psf_image',
+    'plot_radial_profile',
     'plot_residual',
+    'plot_residual_image',
     'plot_residual_vectors',
     'plot_shape_map',
     'plot_stated_errors',

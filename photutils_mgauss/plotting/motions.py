@@ -4,8 +4,10 @@ import numpy as np
 from photutils_mgauss.plotting.style import BLUE, ORANGE, current_axes
 
 __all__ = [
+    'plot_cutouts',
     'plot_errors_by_epochs',
     'plot_motion_errors',
+    'plot_motions_by_magnitude',
     'plot_proper_motions',
     'plot_residual_vectors',
 ]
@@ -22,8 +24,8 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     epoch : int
         Number of the epoch, from 0.
     scale : float, optional
-        Residual [mas] as long as a tenth of the field; the default is three
-        times the median residual.
+        Residual [mas] as long as a tenth of the field, which the key shows;
+        the default is three times the median residual.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw; None is pyplot's current Axes.
 
@@ -39,15 +41,20 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     good = np.isfinite(x + y + u + v)
     if scale is None:
         scale = 3 * np.median(np.hypot(u[good], v[good]))
-    width = np.ptp(x[good]) / 10
+    unit = scale / (np.ptp(x[good]) / 10)
     used = np.asarray(rows['used'])
     for which, colour in ((good & used, BLUE), (good & ~used, ORANGE)):
-        ax.quiver(x[which], y[which], u[which], v[which], color=colour,
-                  angles='xy', scale_units='xy', scale=scale / width)
-    ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal',
-           title=f'epoch {epoch}: a tenth of the field is {scale:.2g} '
-                 f'{rows["dra"].unit}')
+        arrows = ax.quiver(x[which], y[which], u[which], v[which],
+                           color=colour, angles='xy', scale_units='xy',
+                           scale=unit)
+    # The frame holds the tips, too.
+    ax.update_datalim(np.column_stack([x + u / unit, y + v / unit])[good])
+    ax.autoscale_view()
+    ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal')
+    ax.set_title(f'epoch {epoch}', loc='left')
     ax.invert_xaxis()
+    ax.quiverkey(arrows, 0.85, 1.04, scale, f'{scale:.2g} {rows["dra"].unit}',
+                 labelpos='W', color=BLUE)
     return ax
 
 
@@ -65,7 +72,7 @@ def _field_coordinates(rows):
             3600 * (dec - middle))
 
 
-def plot_proper_motions(stars, *, ax=None):
+def plot_proper_motions(stars, *, membership=None, ax=None):
     """
     Plot the proper-motion diagram of a table of stars.
 
@@ -73,6 +80,9 @@ def plot_proper_motions(stars, *, ax=None):
     ----------
     stars : `~astropy.table.QTable`
         As `~photutils_mgauss.MotionSolution.stars`.
+    membership : (n,) array_like, optional
+        The probability of each to be a member of a cluster, which gives
+        stars their colour.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw; None is pyplot's current Axes.
 
@@ -83,6 +93,11 @@ def plot_proper_motions(stars, *, ax=None):
     """
     ax = current_axes(ax)
     reference = _is_reference(stars)
+    if membership is not None:
+        free = ~reference & np.isfinite(np.asarray(membership))
+        ax.scatter(stars['pmra'][free].value, stars['pmdec'][free].value, 9,
+                   np.asarray(membership)[free], cmap='viridis', vmin=0,
+                   vmax=1, zorder=3)
     for which, colour, label in ((~reference, BLUE, 'stars'),
                                  (reference, ORANGE, 'references')):
         some = stars[which]
@@ -103,7 +118,37 @@ def _is_reference(stars):
     return np.ma.filled(stars['reference'], '') != ''
 
 
-def plot_motion_errors(stars, magnitude, *, ax=None):
+def plot_motions_by_magnitude(stars, magnitude, *, ax=None):
+    """
+    Plot both proper motions against magnitude.
+
+    A trend is a systematic error; see ``terms`` of
+    `~photutils_mgauss.ProperMotionFitter`.
+
+    Parameters
+    ----------
+    stars : `~astropy.table.QTable`
+        As for `plot_proper_motions`.
+    magnitude : (n,) array_like
+        A magnitude for each.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+    """
+    ax = current_axes(ax)
+    for name, colour in (('pmra', ORANGE), ('pmdec', BLUE)):
+        ax.errorbar(np.asarray(magnitude), stars[name].value,
+                    stars[f'{name}_error'].value, fmt='.', color=colour,
+                    alpha=0.5, elinewidth=0.5, markersize=3, label=name)
+    ax.set(xlabel='magnitude [mag]', ylabel=f'motion [{stars["pmra"].unit}]')
+    ax.legend()
+    return ax
+
+
+def plot_motion_errors(stars, magnitude, *, bound=None, ax=None):
     """
     Plot errors of motions against magnitude (as Fig. 12 of Nie et al.).
 
@@ -113,6 +158,8 @@ def plot_motion_errors(stars, magnitude, *, ax=None):
         As for `plot_proper_motions`.
     magnitude : (n,) array_like
         A magnitude for each.
+    bound : (n,) array_like, optional
+        The smallest error that is possible, in the same unit.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw; None is pyplot's current Axes.
 
@@ -128,6 +175,10 @@ def plot_motion_errors(stars, magnitude, *, ax=None):
         ax.plot(np.asarray(magnitude)[free],
                 stars[f'{name}_error'][free].value, '.', color=colour,
                 markersize=3, label=name)
+    if bound is not None:
+        order = np.argsort(np.asarray(magnitude)[free])
+        ax.plot(np.asarray(magnitude)[free][order],
+                np.asarray(bound)[free][order], color='black', label='bound')
     ax.set(yscale='log', xlabel='magnitude [mag]',
            ylabel=f'error [{stars["pmra"].unit}]')
     ax.legend()
@@ -162,3 +213,66 @@ def plot_errors_by_epochs(solutions, *, ax=None):
     ax.set(xlabel='number of epochs', ylabel=f'median error [{unit}]')
     ax.legend()
     return ax
+
+
+def plot_cutouts(cutouts, *, ax=None):
+    """
+    Draw what each image shows of one star: data, model and residual.
+
+    Parameters
+    ----------
+    cutouts : `~astropy.table.QTable`
+        As `~photutils_mgauss.PixelMotionSolution.cutouts` returns it.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        Its Axes: a column for each image, grey from -2 to 5 times the
+        scatter of the residuals in it. Crosses are where the fit has the
+        star.
+
+    Raises
+    ------
+    ValueError
+        If the table has no rows.
+    """
+    if not len(cutouts):
+        msg = 'cutouts must have at least one row, got none'
+        raise ValueError(msg)
+    ax = current_axes(ax)
+    parts = ('data', 'model', 'residual')
+    stamps = np.stack([_plain(cutouts[name]) for name in parts])
+    _, n, ny, nx = stamps.shape
+    # Images of different depth are shown alike.
+    noise = 1.4826 * np.nanmedian(np.abs(stamps[2]), axis=(1, 2))
+    stamps = stamps / np.where(noise > 0, noise, 1)[:, None, None]
+    picture = np.full((3 * (ny + 1) - 1, n * (nx + 1) - 1), np.nan)
+    for i in range(3):
+        for k in range(n):
+            top, left = (2 - i) * (ny + 1), k * (nx + 1)
+            picture[top:top + ny, left:left + nx] = stamps[i, k]
+    ax.imshow(picture, origin='lower', cmap='gray_r', vmin=-2, vmax=5,
+              interpolation='nearest')
+    _mark_star(ax, cutouts, (ny, nx))
+    ax.set_xticks((nx + 1) * np.arange(n) + (nx - 1) / 2,
+                  [f'{year:.2f}' for year in _plain(cutouts['time'])])
+    ax.set_yticks((ny + 1) * np.arange(3) + (ny - 1) / 2, parts[::-1])
+    ax.tick_params(length=0)
+    ax.set(xlabel='year')
+    return ax
+
+
+def _mark_star(ax, cutouts, shape):
+    """Mark the place of the star in all stamps."""
+    ny, nx = shape
+    x, y = _plain(cutouts['x']), _plain(cutouts['y'])
+    columns = (nx + 1) * np.arange(len(x)) + (nx - 1) // 2 + x - np.rint(x)
+    for i in range(3):
+        ax.plot(columns, (ny + 1) * i + (ny - 1) // 2 + y - np.rint(y), '+',
+                color=ORANGE, markersize=4, markeredgewidth=0.7)
+
+
+def _plain(column):
+    return np.asarray(getattr(column, 'value', column), float)

@@ -3,8 +3,9 @@ Errors of stars beyond those of independent pixels.
 
 What a star's fit makes of an error of its PSF, :math:`f\,\delta P_r`, is
 :math:`f (J^T W J)^{-1} J^T W\, \delta P_r`; the sum of the squares over the
-directions r is the PSF's part of the star's covariance. Where the noise of
-pixels is correlated, with the matrix R of correlations, the covariance is
+directions r is the PSF's part of the star's covariance, together with what
+light in the wrong pixels does. Where the noise of pixels is correlated, with
+the matrix R of correlations, the covariance is
 
 .. math::
 
@@ -142,6 +143,30 @@ class StarPixels:
             psf[part], noise[part] = one, other
         return psf, noise
 
+    def shifts(self, executor=None):
+        """
+        Return how the fits of stars answer each change of the PSF.
+
+        Returns
+        -------
+        (n, 3, R) `~numpy.ndarray`
+            Of the flux, as a part of it, and of x and y [pix]; NaN for what
+            is not fitted.
+        """
+        out = np.full((len(self.values), 3, self.psf.changes.shape[1]),
+                      np.nan)
+        templates = self._templates()
+        order = np.argsort(templates[2], kind='stable')
+        size = max(1, _CHUNK // (int(np.prod(self.fit_shape))
+                                 * (3 + out.shape[2])))
+        parts = [order[i:i + size] for i in range(0, order.size, size)]
+        work = partial(self._shifts, *templates)
+        for part, one in zip(parts, map_parallel(
+                work, parts, executor=executor, long=len(parts) > 1),
+                strict=True):
+            out[np.ix_(part, self.free)] = one[0]
+        return out
+
     def _templates(self):
         """Return node, phases and the number of both for each star."""
         _, x, y = self.values.T
@@ -152,24 +177,32 @@ class StarPixels:
         key = (node * _PHASES + steps[0]) * _PHASES + steps[1]
         return node, phase, key
 
-    def _part(self, node, phase, key, matrix, rows):
+    def _shifts(self, node, phase, key, rows):
+        """Return shifts, covariances, derivatives, weights and PSFs."""
         _, first, which = np.unique(key[rows], return_index=True,
                                     return_inverse=True)
         some = rows[first]
         images = self.psf.images(
             node[some], phase[0][some], phase[1][some], self.fit_shape,
             integrated=self.integrated)[which]
-        flux = self.values[rows, 0]
-        weight = self._weights(rows, np.maximum(flux[:, None] * images[:, 0],
-                                                0))
+        weight = self._weights(rows, np.maximum(
+            self.values[rows, :1] * images[:, 0], 0))
         design = images[:, self.free]
         if self.fit_sky:
             design = np.concatenate([design, np.ones_like(design[:, :1])], 1)
         # Fluxes in units of the flux: x and y then answer in pixels.
         shifts, inverse = responses(design, weight, images[:, 3:])
-        n_free = self.free.size
-        shifts = shifts[:, :n_free]
+        return (shifts[:, :self.free.size], inverse, design, weight,
+                images[:, 0])
+
+    def _part(self, node, phase, key, matrix, rows):
+        shifts, inverse, design, weight, light = self._shifts(
+            node, phase, key, rows)
+        flux, n_free = self.values[rows, 0], self.free.size
         psf = shifts @ shifts.transpose(0, 2, 1)
+        if self.psf.misfit:
+            psf += self.psf.misfit**2 * _answer(
+                design, inverse, weight, light)[:, :n_free, :n_free]
         units = np.where(self.free == 0, flux[:, None], 1.0)
         psf *= units[:, :, None] * units[:, None]
         if matrix is None:
@@ -207,6 +240,18 @@ class StarPixels:
         usable = (inside.reshape(light.shape) & (variance > 0)
                   & np.isfinite(variance))
         return np.where(usable, 1 / np.where(usable, variance, 1), 0)
+
+
+def _answer(design, inverse, weight, light):
+    """
+    Return the covariances of fits to pixels that are off by their light.
+
+    No light is lost: what is missing in one pixel is in the others.
+    """
+    moved = inverse @ (design * (weight * light)[:, None])
+    total = light.sum(axis=1)[:, None, None]
+    moved -= moved.sum(axis=2, keepdims=True) * light[:, None] / total
+    return moved @ moved.transpose(0, 2, 1)
 
 
 def _growth(design, inverse, root, matrix, n_free):

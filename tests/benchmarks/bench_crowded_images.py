@@ -177,25 +177,24 @@ def scatter(values):
     return 1.48 * np.nanmedian(np.abs(values)) if values.size else np.nan
 
 
+def complete_at(field, row, mag):
+    """Return the share of stars around a magnitude that are found."""
+    near = field.inside & (np.abs(field.mag - mag) < 0.25)
+    return np.mean(row[near] >= 0)
+
+
 def limit(field, row):
     """Return the magnitude at which half of the stars are found."""
-    edges = np.arange(22, 26.01, 0.25)
-    share = [np.mean(row[field.inside & (np.abs(field.mag - m) < 0.25)] >= 0)
-             for m in edges]
-    below = np.flatnonzero(np.array(share) < 0.5)
-    if not below.size or below[0] == 0:
-        return np.nan
-    k = below[0]
-    return float(np.interp(0.5, share[k - 1:k + 1][::-1],
-                           edges[k - 1:k + 1][::-1]))
+    edges = np.arange(22, 25.76, 0.125)
+    share = np.array([complete_at(field, row, mag) for mag in edges])
+    return float(np.interp(-0.5, -np.minimum.accumulate(share), edges))
 
 
 def print_list(name, field, listed, seconds):
     row = listed.match(field)
     half = (len(field.frames) + 1) // 2
-    print(f'\n{name}: {len(listed.x)} stars, {seconds:.1f} CPU s, half are '
-          f'found at {limit(field, row):.2f} mag\n mag      n  complete  '
-          'flux bias [mag]  colour bias [sigma]  pull of flux')
+    print(f'\n{name}: {len(listed.x)} stars, {seconds:.1f} CPU s\n mag      n'
+          '  complete  flux bias [mag]  colour bias [sigma]  pull of flux')
     for low in range(18, 26):
         here = field.inside & (field.mag >= low) & (field.mag < low + 1)
         found = here & (row >= 0)
@@ -259,11 +258,14 @@ def main():
     rows = {'single images': (stacked, print_list(
         'single images, averaged', field, stacked, single * len(alone)))}
     rows['together'] = joint, print_list('together', field, joint, seconds)
-    gain = limit(field, rows['together'][1]) - limit(
-        field, alone[0].match(field))
-    print(f'\nthe limit is deeper by {gain:.2f} mag, the root of n says '
-          f'{1.25 * np.log10(args.images):.2f}; the time is '
-          f'{seconds / single:.1f} times that of one image')
+    one = alone[0].match(field)
+    mag, deeper = limit(field, one), 1.25 * np.log10(args.images)
+    print(f'\nat {mag:.2f} mag one image finds '
+          f'{complete_at(field, one, mag):.1%}, together they find '
+          f'{complete_at(field, rows["together"][1], mag):.1%}, one finds '
+          f'{complete_at(field, one, mag - deeper):.1%} where stars are '
+          f'{deeper:.2f} mag brighter; the time is {seconds / single:.1f} '
+          'times that of one image')
     if args.motions:
         print_motions(field, rows)
 

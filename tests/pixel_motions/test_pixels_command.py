@@ -54,6 +54,35 @@ def test_images_become_motions_and_light_curves(folder):
     curves = QTable.read(out / 'light_curves.ecsv')
     assert len(curves) == stars['n_images'].sum()
     assert len(QTable.read(out / 'images.ecsv')) == 3
+    strip = QTable.read(out / 'cutouts.ecsv')
+    assert strip['residual'].shape[1:] == (15, 15)
+    assert strip.meta['SIGNIF'] == stars['significance'][
+        stars['flags'] == 0].min()
+
+
+def test_the_page_shows_a_faint_star_and_the_gain(folder):
+    pytest.importorskip('matplotlib')
+    frames, out = folder / 'frames', folder / 'gain'
+    frames.mkdir()
+    before = QTable.read(folder / 'truth.ecsv')['ra', 'dec', 'pmra']
+    before['pmra_error'] = np.where(np.arange(len(before)) < 5, 0.5,
+                                    np.nan) * before['pmra'].unit
+    before.write(frames / 'motions.ecsv')
+    for name in NIGHTS:
+        (frames / f'{name}_wcs.asdf').write_bytes(
+            (folder / f'{name}_wcs.asdf').read_bytes())
+    assert run(folder, '--output', out, '--frames', frames) in (0, None)
+    page = folder / 'page.html'
+    assert main(['report', str(out), '--output', str(page)]) in (0, None)
+    words = page.read_text()
+    assert 'A faint star' in words
+    assert 'With proper motions from catalogues' in words
+    stars = QTable.read(out / 'motions.ecsv')
+    gain = stars.meta['mgauss']['catalogues']
+    assert gain['motions'] == 5
+    assert gain['both'] == 5
+    assert gain['median_error_catalogues'] == 0.5
+    assert 0 < gain['median_error_pixels'] < 20
 
 
 def test_places_given_are_kept_and_results_too(folder):

@@ -70,3 +70,22 @@ def test_errors_against_magnitude_and_epochs_are_those_of_the_table(
                 for one in solutions]
     assert_allclose(line.get_ydata(), [np.median(errors.value)
                                        for errors in measured])
+
+
+def test_cutouts_show_each_image_three_times(axes, rng):
+    from photutils_mgauss.plotting import plot_cutouts
+    stamps = rng.normal(0, 2, (3, 2, 5, 5))
+    table = QTable({'time': [2024.0, 2026.5], 'x': [10.0, 12.4],
+                    'y': [7.0, 7.0], 'data': stamps[0], 'model': stamps[1],
+                    'residual': stamps[2]})
+    plot_cutouts(table, ax=axes)
+    shown = axes.images[0].get_array()
+    assert shown.shape == (17, 11)
+    scatter = 1.4826 * np.median(np.abs(stamps[2]), axis=(1, 2))
+    assert_allclose(shown[12:, :5], stamps[0, 0] / scatter[0])
+    assert_allclose(shown[:5, 6:], stamps[2, 1] / scatter[1])
+    assert_allclose(axes.lines[0].get_xdata(), [2, 8.4])
+    assert [text.get_text() for text in axes.get_xticklabels()] == [
+        '2024.00', '2026.50']
+    with pytest.raises(ValueError, match='at least one row'):
+        plot_cutouts(table[:0], ax=axes)
