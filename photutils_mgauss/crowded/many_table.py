@@ -14,7 +14,6 @@ from photutils_mgauss.crowded.table import (
     NO_FLUX,
     STILL,
     inside,
-    misfit,
     quality_of,
     significant,
     unlike_a_star,
@@ -53,7 +52,7 @@ def tabulate(tile):
     s, near = tile.stars, tile.neighbours
     quality = [quality_of(model) for model in tile.models]
     place, variance, correlation = tile.equations.covariances()
-    factor = np.array([misfit(one) for one in quality])
+    factor = np.array([_unseen(one) for one in quality])
     count, chi2 = (np.array([one[:, i] for one in quality]) for i in (0, 1))
     informed = np.nan_to_num(tile.fluxes**2 / variance)
     place = place * _mean(factor, informed)[:, None, None]
@@ -77,6 +76,18 @@ def tabulate(tile):
     v_0, u_0 = tile.origin
     table = with_repeats(table, tile.repeats).moved(u_0, v_0)
     return table.chosen(inside(table, tile.job.core))
+
+
+def _unseen(quality):
+    """
+    Return the factor of the variance for light that is in no star's model.
+
+    What is left of stars that were not found raises the chi2 of a stamp.
+    """
+    count, chi2 = quality[:, 0], quality[:, 1]
+    # Each star has taken about three degrees of freedom from its stamp; six
+    # pixels' worth of prior keeps small numbers from swinging.
+    return np.maximum((chi2 + 6) / np.maximum(count + 3, 6), 1.0)
 
 
 def _mean(values, weights):

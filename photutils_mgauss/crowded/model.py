@@ -172,10 +172,11 @@ class Model:
     def take_in_place(self, step, level_step, changed):
         """Take a step that changes some stars only; stamps stay in place."""
         self._add_stars(changed, 1.0)
-        before = self.background()
+        before = self.level
         self.take(step, level_step)
         self._draw_stamps(changed)
-        self.residual += before - self.background()
+        # The background is linear in its levels.
+        self.residual += self.mesh.image(before - self.level)
         self._add_stars(changed, -1.0)
         self._weigh()
 

@@ -63,7 +63,7 @@ def tabulate(tile, core):
     quality = quality_of(model)
     covariance, correlation = tile.equations.covariances()
     hidden = _hidden(tile, covariance)
-    covariance = covariance * misfit(quality)[:, None, None]
+    covariance = covariance * _misfit(quality)[:, None, None]
     with np.errstate(invalid='ignore'):
         error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     count, chi2, deviation, centre, crowding, _ = quality.T
@@ -129,7 +129,7 @@ def quality_of(model):
     return out
 
 
-def misfit(quality):
+def _misfit(quality):
     """
     Return the factor of the variance where the model does not fit.
 
