@@ -13,10 +13,11 @@ from photutils_mgauss.cli import (
     photometry,
     psf,
     report,
+    survey,
 )
 from photutils_mgauss.cli.running import run_command
 
-_COMMANDS = (psf, photometry, motions, report, info, demo_command,
+_COMMANDS = (psf, photometry, motions, report, survey, info, demo_command,
              compile_command)
 
 _EPILOG = """\

@@ -28,6 +28,17 @@ th:first-child, td:first-child { text-align: left; white-space: normal; }
 details { margin: 12px 0; font-size: 0.9em; }
 summary { cursor: pointer; color: #00558a; }
 pre { overflow-x: auto; background: #f2f5f8; padding: 8px; }
+.verdict { font-weight: 600; padding-left: 10px; border-left: 6px solid; }
+.good { border-color: #009e73; }
+.look { border-color: #d55e00; }
+@media (prefers-color-scheme: dark) {
+  body { color: #dce4ea; background: #15191d; }
+  figcaption { color: #a9bccb; }
+  nav a, summary { color: #7cc0ee; }
+  pre { background: #22282e; }
+  th, td { border-color: #38424b; }
+  figure img { background: #fff; border-radius: 4px; }
+}
 """
 
 
@@ -40,10 +51,19 @@ class Panel:
 
 
 @dataclass(frozen=True)
+class Verdict:
+    """Whether a result is good, in one sentence with its numbers."""
+
+    good: bool
+    words: str
+
+
+@dataclass(frozen=True)
 class Section:
     """What a page says of one result."""
 
     title: str
+    verdict: Verdict | None = None
     text: str = ''
     facts: dict = field(default_factory=dict)
     panels: tuple = ()
@@ -68,7 +88,8 @@ def html_page(title, sections, record):
     -------
     str
     """
-    links = ''.join(f'<li><a href="#part{i}">{escape(section.title)}</a></li>'
+    links = ''.join(f'<li><a href="#part{i}">{escape(section.title)}</a>'
+                    f'{_verdict("span", section.verdict)}</li>'
                     for i, section in enumerate(sections))
     parts = ''.join(_part(i, section) for i, section in enumerate(sections))
     return (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -81,10 +102,22 @@ def html_page(title, sections, record):
             f'{_details("How this page was made", record)}</body></html>\n')
 
 
+def _verdict(tag, verdict):
+    """Return a verdict as an element of the page."""
+    if verdict is None:
+        return ''
+    kind, word = (('good', 'Good') if verdict.good else
+                  ('look', 'Look at this'))
+    gap = '' if tag == 'p' else ' '
+    return (f'{gap}<{tag} class="verdict {kind}">{word}: '
+            f'{escape(verdict.words)}</{tag}>')
+
+
 def _part(number, section):
     figures = ''.join(_figure(section.title, panel)
                       for panel in section.panels)
     return (f'<section id="part{number}"><h2>{escape(section.title)}</h2>'
+            + _verdict('p', section.verdict)
             + (f'<p>{escape(section.text)}</p>' if section.text else '')
             + _facts(section.facts)
             + (f'<div class="figures">{figures}</div>' if figures else '')

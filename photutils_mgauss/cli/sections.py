@@ -5,14 +5,19 @@ from types import SimpleNamespace
 import numpy as np
 
 from photutils_mgauss import plotting
-from photutils_mgauss.cli.page import Panel, Section
+from photutils_mgauss.cli.page import Panel, Section, Verdict
 from photutils_mgauss.cli.psf_files import psf_kind, psf_record, read_psf
+from photutils_mgauss.cli.seen_image import seen_image
 from photutils_mgauss.plotting.style import BLACK
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.star_columns import column_values
 
 # Nodes that whiskers and maps show along each axis at most.
 _SHOWN = 12
+# Ticks that axes of reduced chi2 and the like may have.
+_TICKS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 1000)
+# A median of reduced chi2 or uwe in this range says that errors are right.
+_RIGHT = (0.8, 1.25)
 
 
 def psf_section(path):
@@ -32,11 +37,26 @@ def psf_section(path):
             value = record[name]
             facts[words] = f'{value:.2g}' if name == 'accuracy' else value
     panels = [Panel(lambda ax: plotting.plot_psf_image(psf, *middle, ax=ax),
-                    'The PSF in the middle of the detector.')]
+                    'The PSF in the middle of the detector.'),
+              Panel(lambda ax: plotting.plot_radial_profile(psf, *middle,
+                                                            ax=ax),
+                    'The same against the distance from the centre; the '
+                    'band spans all directions.')]
     if len(psf.grid_xypos) > 1:
         panels += _maps(psf, record.get('stars'))
-    return Section(f'PSF: {path}', facts=facts, panels=tuple(panels),
-                   record=record)
+    return Section(f'PSF: {path}', verdict=_psf_verdict(fwhm, record),
+                   facts=facts, panels=tuple(panels), record=record)
+
+
+def _psf_verdict(fwhm, record):
+    """Judge a PSF by the number of its stars, if it was made of stars."""
+    words = f'FWHM {np.median(fwhm):.2f} pix, {np.ptp(fwhm):.2f} pix of range'
+    stars, degree = record.get('n_stars'), record.get('degree')
+    if stars is None or degree is None:
+        return Verdict(True, words)
+    terms = (degree + 1) * (degree + 2) // 2
+    return Verdict(stars >= 2 * terms, f'{words}; made of {stars} stars for '
+                   f'the {terms} terms of a polynomial of degree {degree}')
 
 
 def _maps(psf, stars):
@@ -72,8 +92,21 @@ def catalogue_section(path, table, record):
     good = np.asarray(table['flags']) == 0 if 'flags' in table.colnames else (
         np.ones(len(table), bool))
     facts = _star_facts(table, good) | _when(record)
-    return Section(f'Catalogue: {path}', facts=facts,
-                   panels=tuple(_star_panels(table, good)), record=record)
+    panels = _star_panels(table, good, seen_image(path, table, record))
+    return Section(f'Catalogue: {path}', verdict=_star_verdict(table, good),
+                   facts=facts, panels=tuple(panels), record=record)
+
+
+def _star_verdict(table, good):
+    """Judge a catalogue by its flags and by how well the PSF fits."""
+    words = f'{int(good.sum())} of {len(table)} stars without flags'
+    if 'reduced_chi2' not in table.colnames or not good.any():
+        return Verdict(good.mean() > 0.5, words)
+    chi2 = float(np.nanmedian(column_values(table, 'reduced_chi2')[good]))
+    right = _RIGHT[0] < chi2 < _RIGHT[1]
+    return Verdict(bool(good.mean() > 0.5 and right), f'{words}; their '
+                   f'median reduced chi2 is {chi2:.2f} (1 if the PSF and the '
+                   'errors of pixels are right)')
 
 
 def _star_facts(table, good):
@@ -87,19 +120,20 @@ def _star_facts(table, good):
                 f'{np.nanmedian(error[bright & good]):.4f}'}
 
 
-def _star_panels(table, good):
-    """Return the figures of a catalogue's stars."""
+def _star_panels(table, good, seen):
+    """Return the figures of a catalogue's stars, on its image if seen."""
     flux = column_values(table, 'flux_fit')
     unit = getattr(table['flux_fit'], 'unit', None)
     with np.errstate(invalid='ignore', divide='ignore'):
         magnitude = -2.5 * np.log10(flux)
-    label = f'-2.5 log flux{"" if unit is None else f" / ({unit})"} [mag]'
+    label = f'-2.5 log10(flux{"" if unit is None else f" in {unit}"})'
     errors = {name: column_values(table, name)[good]
               for name in ('x_err', 'y_err')}
     x, y = column_values(table, 'x_fit'), column_values(table, 'y_fit')
     panels = [
-        Panel(lambda ax: plotting.plot_detections(x, y, flux, ax=ax),
-              'The stars, brighter ones larger.'),
+        Panel(lambda ax: plotting.plot_detections(
+            x, y, flux, data=seen and seen.data, ax=ax),
+            'The stars, brighter ones larger.'),
         Panel(lambda ax: plotting.plot_stated_errors(
             magnitude[good], errors, unit='pix', label=label, ax=ax),
             'Errors of position against magnitude, of stars without flags.')]
@@ -109,11 +143,22 @@ def _star_panels(table, good):
             lambda ax: _chi2(ax, magnitude[good], chi2, label),
             'How well the PSF describes the stars: 1 if noise is all that '
             'is left.'))
+    if seen is not None and seen.residual is not None:
+        panels.append(Panel(
+            lambda ax: plotting.plot_residual_image(seen.residual, seen.error,
+                                                    ax=ax),
+            'What the stars leave of the image, in standard errors.'))
     return panels
 
 
 def _chi2(ax, magnitude, chi2, label):
     plotting.plot_stated_errors(magnitude, chi2, unit='', label=label, ax=ax)
+    low, high = ax.get_ylim()
+    if high < 5 * low:
+        ax.set_yscale('linear')
+    else:
+        ticks = [tick for tick in _TICKS if low <= tick <= high]
+        ax.set_yticks(ticks, [f'{tick:g}' for tick in ticks])
     ax.set_ylabel('reduced chi2')
     ax.axhline(1, color=BLACK, linewidth=0.8)
 
@@ -142,7 +187,25 @@ def motion_section(path, table, record):
                 f'{np.median(values):.3f}')
     panels = _motion_panels(table, solved, free) if solved.any() else ()
     return Section(f'Proper motions: {path}', facts=facts, panels=panels,
+                   verdict=_motion_verdict(table, solved, free),
                    text=' '.join(record.get('notes', [])), record=record)
+
+
+def _motion_verdict(table, solved, free):
+    """Judge motions by how many stars have one, and by their residuals."""
+    words = (f'{int(solved.sum())} of {len(table)} objects have proper '
+             'motions')
+    if 'uwe' not in table.colnames:
+        return Verdict(bool(solved.mean() > 0.5), words)
+    uwe = column_values(table, 'uwe')[solved & free]
+    uwe = uwe[np.isfinite(uwe) & (uwe > 0)]
+    if not uwe.size:
+        return Verdict(bool(solved.mean() > 0.5), f'{words}; two epochs leave '
+                       'nothing to judge their errors by')
+    middle = float(np.median(uwe))
+    return Verdict(
+        bool(solved.mean() > 0.5 and _RIGHT[0] < middle < _RIGHT[1]),
+        f'{words}; residuals are {middle:.2f} times the stated errors')
 
 
 def _gain(catalogues, unit):
@@ -174,7 +237,7 @@ def _motion_panels(table, solved, free):
         panels.append(Panel(
             lambda ax: plotting.plot_stated_errors(
                 magnitude, errors, unit=str(table['pmra'].unit),
-                label='-2.5 log flux [mag]', ax=ax),
+                label='-2.5 log10(flux)', ax=ax),
             'Errors of the motions of stars against magnitude.'))
     return tuple(panels)
 
@@ -185,7 +248,7 @@ def cutout_section(path, table, record):
     if len(table):
         facts |= {'Star': table.meta['ID'], 'Signal to noise in all images':
                   f'{table.meta["SIGNIF"]:.1f}'}
-    panels = (Panel(lambda ax: plotting.plot_cutouts(ax, table),
+    panels = (Panel(lambda ax: plotting.plot_cutouts(table, ax=ax),
                     'Each image, what the fit makes of it, and the rest.'),
               ) if len(table) else ()
     return Section(f'A faint star: {path}', facts=facts, panels=panels,
@@ -195,9 +258,10 @@ def cutout_section(path, table, record):
 
 def alignment_section(path, table, record):
     """Return the section on how epochs were aligned."""
-    rows = []
+    rows, names = [], _names_of_epochs(record)
     for row in table:
-        line = {'Epoch': int(row['epoch']), 'Year':
+        epoch = int(row['epoch'])
+        line = {'Epoch': names.get(epoch, epoch), 'Year':
                 f'{getattr(row["time"], "jyear", row["time"]):.3f}'}
         for name in ('shift', 'shift_error', 'systematic'):
             value = row[name]
@@ -210,8 +274,28 @@ def alignment_section(path, table, record):
                 line[words] = _number(row[name])
         rows.append(line)
     return Section(f'Alignment: {path}', rows=rows, record=record,
+                   verdict=_alignment_verdict(table, names),
                    text='What the frame of each exposure was shifted by, in '
                         'the middle of the field, and how well it fits.')
+
+
+def _names_of_epochs(record):
+    """Return the names of the files that epochs were made of, by number."""
+    inputs = record.get('options', {}).get('inputs', [])
+    return {i: Path(name).name for i, name in enumerate(inputs)}
+
+
+def _alignment_verdict(table, names):
+    """Judge an alignment by the references that were rejected."""
+    if not {'n_references', 'n_rejected'} <= set(table.colnames):
+        return None
+    used = column_values(table, 'n_references')
+    share = column_values(table, 'n_rejected') / np.maximum(used, 1)
+    worst = int(np.argmax(share))
+    name = names.get(worst, f'epoch {worst}')
+    return Verdict(bool(used.min() >= 5 and share[worst] < 0.25),
+                   f'{int(used.min())} references or more in every epoch, at '
+                   f'most {share[worst]:.0%} of them rejected ({name})')
 
 
 def _number(value):
@@ -223,17 +307,19 @@ def _number(value):
 def residual_section(path, table, record):
     """Return the section on the residuals of all detections."""
     rows = table[_judged(table)]
-    shown = SimpleNamespace(residuals=rows)
+    shown, names = SimpleNamespace(residuals=rows), _names_of_epochs(record)
     epochs, counts = np.unique(np.asarray(rows['epoch']), return_counts=True)
     panels = [Panel(lambda ax, epoch=epoch: plotting.plot_residual_vectors(
-        shown, epoch, ax=ax), f'Residuals of epoch {epoch}.')
+        shown, epoch, ax=ax),
+        f'Residuals of {names.get(epoch, f"epoch {epoch}")}.')
         for epoch in epochs[counts > 1].tolist()]
     return Section(
         f'Residuals: {path}', panels=tuple(panels), record=record,
         facts={'Detections': len(table),
-               'That anything can be said of': len(rows)},
-        text='Detections less the straight motions of their stars; those '
-             'left out are orange. Two detections always lie on a line.')
+               'Detections of stars with three or more': len(rows)},
+        text='Each arrow is a detection minus the fitted motion of its star; '
+             'rejected detections are orange. A star with two detections '
+             'has no residuals, because a line passes through both.')
 
 
 def _judged(table):

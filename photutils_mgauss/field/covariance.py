@@ -89,7 +89,7 @@ def _variation(fit):
         -1, len(fit.coefficients))
     # Without terms of degree 1 the ratios of the constants must do.
     return variance[:, 1:3].mean(axis=1) if len(
-        fit.coefficients) > 1 else variance[:, 0]
+        fit.coefficients) > 1 + fit.problem.n_extra else variance[:, 0]
 
 
 @dataclass
@@ -202,7 +202,8 @@ def shape_covariance(covariance, unmodelled, basis):
     return np.einsum('nptq,nt->npq', half, basis) + np.diag(unmodelled)
 
 
-def psf_errors(at, covariance, unmodelled, degree, shape, integrated):
+def psf_errors(at, covariance, unmodelled, degree, shape, integrated,
+               more=(), misfit=0.0):
     """
     Return the errors of a field's PSF.
 
@@ -210,13 +211,18 @@ def psf_errors(at, covariance, unmodelled, degree, shape, integrated):
     ----------
     at : callable
         ``at(x, y, change)`` returns the polynomials (n, T), weights, means
-        and covariances at places (n,), with P numbers added to the shapes.
+        and covariances at places (n,), with P numbers added to the shapes
+        and Q to others.
     covariance, unmodelled : (N, N), (P,) `~numpy.ndarray`
     degree : int
     shape : (int, int)
         Of the detector.
     integrated : bool
         Whether the mixtures are to be integrated over pixels.
+    more : (Q,) sequence of float, optional
+        The variances of the other numbers, the same everywhere.
+    misfit : float, optional
+        By what share of it the light in pixels is off.
 
     Returns
     -------
@@ -227,21 +233,41 @@ def psf_errors(at, covariance, unmodelled, degree, shape, integrated):
     n = max(2 * degree + 1, 7) if degree else 1
     axes = [(np.arange(n) + 0.5) * size / n - 0.5 for size in shape[::-1]]
     x, y = (axis.ravel() for axis in np.meshgrid(*axes))
-    zero = np.zeros(unmodelled.size)
-    basis, *mixtures = at(x, y, zero)
-    every = np.stack([_slopes(at, x, y, step) for step in
-                      _STEP * np.eye(unmodelled.size)], axis=1)
+    n_shapes = unmodelled.size
+    size = n_shapes + len(more)
+    basis, *mixtures = at(x, y, np.zeros(size))
+    every = np.moveaxis(slopes(lambda change: _numbers(at(x, y, change)),
+                               size), 0, 1)
     grid = Grid(*axes, *mixtures, np.ones(x.size))
-    found = shape_covariance(covariance, unmodelled, basis)
+    found = np.tile(np.diag([0.0] * n_shapes + list(more)), (x.size, 1, 1))
+    found[:, :n_shapes, :n_shapes] = shape_covariance(covariance, unmodelled,
+                                                      basis)
     return PSFErrors(grid, _directions(PSFErrors(grid, every), found,
-                                       integrated))
+                                       integrated), misfit)
 
 
-def _slopes(at, x, y, step):
-    """Return the changes (n, K, 6) of the mixtures by one of the shapes."""
-    weight, mean, covariance = (
-        (after - before) / (2 * step.sum()) for after, before in zip(
-            at(x, y, step)[1:], at(x, y, -step)[1:], strict=True))
+def slopes(of, size):
+    """
+    Return the derivatives of something by each of the shapes.
+
+    Parameters
+    ----------
+    of : callable
+        ``of(change)`` returns an array for a change (P,) of the shapes.
+    size : int
+        P.
+
+    Returns
+    -------
+    (P, ...) `~numpy.ndarray`
+    """
+    return np.array([(of(step) - of(-step)) / (2 * _STEP)
+                     for step in _STEP * np.eye(size)])
+
+
+def _numbers(found):
+    """Return the numbers (n, K, 6) of mixtures."""
+    _, weight, mean, covariance = found
     return np.concatenate([weight[..., None], mean, covariance[..., 0, :],
                            covariance[..., 1, 1:]], axis=-1)
 

@@ -4,10 +4,12 @@ The fit of a PSF field to the pixels of the stars of one or more images.
 Input is read and checked here, `photutils_mgauss.field.stages` does the
 fitting, and what it found becomes the public results.
 """
+import logging
 import warnings
 from dataclasses import replace
 
 import numpy as np
+from astropy.stats import gaussian_sigma_to_fwhm
 from astropy.table import QTable
 from astropy.utils.exceptions import AstropyUserWarning
 
@@ -17,13 +19,17 @@ from photutils_mgauss.field.base import (
     residual_stars,
     star_table,
 )
+from photutils_mgauss.field.brighter_fatter import measure_fattening
 from photutils_mgauss.field.choice import by_default, choose
+from photutils_mgauss.field.contexts import context_names, lateral_shifts
 from photutils_mgauss.field.covariance import honest_covariance
 from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.growth import (
     FIRST_RADIUS,
+    light_inside,
     measure_wings,
     own_radius,
+    stars_of_exposures,
 )
 from photutils_mgauss.field.input import (
     allow_for_correlation,
@@ -31,16 +37,20 @@ from photutils_mgauss.field.input import (
     read_exposures,
     read_sample,
 )
+from photutils_mgauss.field.misfit import misfit
 from photutils_mgauss.field.mixture_field import MixtureField
-from photutils_mgauss.field.normal import Workers
+from photutils_mgauss.field.normal import Workers, model_stamps
 from photutils_mgauss.field.pixel import chosen_pixel, warn_of_phase
 from photutils_mgauss.field.tuned_field import TunedMixtureField, known_shapes
 from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 
 __all__ = ['fit_mixture_field']
 
+_LOG = logging.getLogger('photutils_mgauss')
 # The degree of the polynomials with a PSF to start from.
 _TUNED_DEGREE = 1
+# How often the field follows what bright stars are wider by.
+_FATTER_STEPS = 2
 # The weight of the centre in widths of the core, and at most in radii of the
 # stamp. A narrower one follows aberrations in a way that no distortion of low
 # degree can describe, a wider one sees more noise.
@@ -50,9 +60,9 @@ _CENTRE_SIZE, _CENTRE_SHARE = 2.0, 0.36
 def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
                       degree=None, radius=None, local_bkg=False,
                       effective_gain=None, reject=True, regularization=None,
-                      start=None, centre='core', normalise='stamps',
+                      start=None, centre='core', normalise='auto',
                       pixel_integrated='auto', correlated_noise=True,
-                      executor=None):
+                      contexts=(), brighter_fatter='auto', executor=None):
     """
     Fit a PSF field to the pixels of stars.
 
@@ -118,20 +128,25 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         a Gaussian that it is convolved with, and a change of its wings and
         of its asymmetry, polynomials of position; ``n_components`` does not
         count then. Fifteen stars are enough.
-    centre : {'core', 'flux'}, optional
+    centre : {'core', 'flux', 'catalogue'}, optional
         What is at the origin of the PSF, which is where positions of stars
         are: the point about which the first moment vanishes under a Gaussian
         weight larger than the core of the PSF, its standard deviation twice
         the full width at half maximum in the middle of the detector, if the
         stamps are large enough for that; or the flux centroid, which wanders
-        from image to image with the noise of the wings. With ``start`` it
-        stays where that of ``start`` is.
-    normalise : {'stamps', 'curve-of-growth'}, optional
-        What is all the flux of a star: that of the Gaussians, as the pixels
-        of the stamps continue them; or with what the stars show in rings
-        beyond their stamps, up to three radii, and as the power law of the
-        outer rings goes on. The light beyond is added as one wide Gaussian.
-        Not with ``start``.
+        from image to image with the noise of the wings; or, with
+        ``contexts``, what 'core' is for the mean star, from which those of
+        other colours are moved as the positions in ``stars`` ask for. They
+        must know nothing of colour then, as those of a catalogue. With
+        ``start`` it stays where that of ``start`` is.
+    normalise : {'auto', 'stamps', 'curve-of-growth'}, optional
+        What is all the flux of a star: 'stamps', that of the Gaussians, as
+        the pixels of the stamps continue them; or 'curve-of-growth', with
+        what the stars show in rings beyond their stamps, up to three radii,
+        and as the power law of the outer rings goes on. The light beyond is
+        added as one wide Gaussian. By default it is added if the rings of at
+        least five stars show it beyond doubt; a message of the level INFO
+        tells. With ``start`` it is that of ``start``.
     pixel_integrated : 'auto' or bool, optional
         Whether the Gaussians are those of the optics, integrated over each
         pixel, or those of the PSF in pixels, sampled at the middle of each.
@@ -144,6 +159,16 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         Whether to look, on blank sky, if the noise of neighbouring pixels is
         correlated, as in resampled images, and to take errors as larger for
         that; a warning says so.
+    contexts : sequence of str, optional
+        Columns of ``stars``, as ``('colour',)``, on which the shapes depend
+        linearly, beside position. A star for which one is unknown (masked or
+        NaN) has the mean of the others. Not with ``start``.
+    brighter_fatter : 'auto' or bool, optional
+        Whether each unit of flux adds a covariance to all Gaussians, because
+        charge repels charge. By default that is so if the stars say so
+        beyond doubt, and a warning tells it; otherwise the field does not
+        change. ``field.mixture_at(x, y)`` is then the PSF of faint stars,
+        that of others needs their ``flux``. Not with ``start``.
     executor : `~concurrent.futures.Executor`, optional
         Where stars are worked on; by default a pool of threads.
 
@@ -177,14 +202,13 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         radius = as_real(radius, 'radius', minimum=2)
     if regularization is not None:
         regularization = as_real(regularization, 'regularization', above=0)
-    as_choice(centre, 'centre', ('core', 'flux'))
-    as_choice(normalise, 'normalise', ('stamps', 'curve-of-growth'))
-    if start is not None and normalise != 'stamps':
-        msg = ("normalise must be 'stamps' with start, whose wings are known "
-               f'already, got {normalise!r}')
-        raise ValueError(msg)
+    contexts = context_names(contexts)
+    _check_words(centre, normalise, brighter_fatter, contexts)
+    if start is not None:
+        _check_known(normalise, contexts, brighter_fatter)
     pixel_integrated = _pixel_integrated(pixel_integrated, start)
-    sample, radius = _read(data, stars, error, mask, radius, effective_gain)
+    sample, radius = _read(data, stars, error, mask, radius, effective_gain,
+                           contexts)
     if correlated_noise:
         allow_for_correlation(sample)
     if start is not None and degree is None:
@@ -203,56 +227,109 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
             problem, pixel_integrated, regularization or 1.0, workers)
         fit, choice = _free(problem, n_components, degree, top, workers,
                             regularization, reject)
-    field = _result(fit, sample, radius, choice, centre)
+        fatter = _fatter(fit, brighter_fatter, workers, reject)
+    field = _result(fit, sample, radius, choice, centre, fatter)
     if normalise == 'stamps':
         return field
     return _with_wings(field, sample, read_exposures(data, stars, error,
-                                                     mask))
+                                                     mask), normalise)
 
 
-def _read(data, stars, error, mask, radius, gain):
+def _check_words(centre, normalise, brighter_fatter, contexts):
+    """Raise unless the options are those that there are."""
+    as_choice(centre, 'centre', ('core', 'flux', 'catalogue'))
+    as_choice(normalise, 'normalise', ('auto', 'stamps', 'curve-of-growth'))
+    if centre == 'catalogue' and not contexts:
+        msg = ("centre must be 'core' or 'flux' without contexts, got "
+               "'catalogue'")
+        raise ValueError(msg)
+    if not isinstance(brighter_fatter, (bool, np.bool_)) and (
+            brighter_fatter != 'auto'):
+        msg = ("brighter_fatter must be 'auto', True or False, got "
+               f'{brighter_fatter!r}')
+        raise ValueError(msg)
+
+
+def _check_known(normalise, contexts, brighter_fatter):
+    """Raise if more is asked of a known PSF than its changes."""
+    if normalise == 'curve-of-growth':
+        msg = ("normalise must be 'stamps' with start, whose wings are known "
+               f'already, got {normalise!r}')
+        raise ValueError(msg)
+    if contexts or brighter_fatter is True:
+        msg = ('contexts and brighter_fatter=True must not be given with '
+               'start, of which only changes with position are fitted')
+        raise ValueError(msg)
+
+
+def _read(data, stars, error, mask, radius, gain, contexts):
     """Return the sample and the radius of its stamps."""
+    given = data, stars, error, mask
     if radius is not None:
-        return read_sample(data, stars, error, mask, radius, gain), radius
-    sample = read_sample(data, stars, error, mask, FIRST_RADIUS, gain)
+        return read_sample(*given, radius, gain, contexts), radius
+    sample = read_sample(*given, FIRST_RADIUS, gain, contexts)
     radius = own_radius(sample.stamps)
     if radius != FIRST_RADIUS:
-        sample = read_sample(data, stars, error, mask, radius, gain)
+        sample = read_sample(*given, radius, gain, contexts)
     return sample, radius
 
 
-def _with_wings(field, sample, exposures):
+def _fatter(fit, wanted, workers, reject):
+    """Return how fluxes widen stars, of which the fit then knows."""
+    if wanted is False:
+        return None
+    found = measure_fattening(fit, workers)
+    if wanted is True and found is None:
+        msg = ('brighter_fatter must be False for so few stars, or stars of '
+               'one flux')
+        raise ValueError(msg)
+    if found is None or not (wanted is True or found.is_real):
+        return None
+    for _ in range(_FATTER_STEPS):
+        fit.fattening = found.value
+        stages.polish(fit, workers, reject)
+        found = measure_fattening(fit, workers)
+    if wanted == 'auto':
+        warnings.warn(
+            'bright stars are wider than faint ones: the brightest by '
+            f'{found.largest * (found.value[0] + found.value[2]) / 2:.4f} '
+            f'pix^2 (chi^2 {found.significance:.0f} for 3 numbers); the PSF '
+            'is that of faint stars, and brighter_fatter of the field says '
+            'how others differ', AstropyUserWarning, stacklevel=4)
+    return found
+
+
+def _with_wings(field, sample, exposures, normalise):
     """Return the field with the light beyond the stamps."""
-    table = field.stars[field.stars['used']]
-    flux = np.asarray(table['flux_fit'].value if hasattr(
-        table['flux_fit'], 'unit') else table['flux_fit'])
-    exposure = (table['exposure'] if 'exposure' in table.colnames
-                else np.zeros(len(table), int))
-    stars = np.column_stack([table['x_fit'], table['y_fit'], flux])
-    pixels = [one for one, _ in exposures]
-    wings = measure_wings(
-        pixels, sample.catalogues,
-        [stars[exposure == i] for i in range(len(pixels))],
-        field.enclosed_flux(*_middle(sample)) + _left(field, flux),
-        field.radius)
+    wings, why_not = measure_wings(
+        (pixels for pixels, _ in exposures), sample.catalogues,
+        stars_of_exposures(field, len(sample.reasons)),
+        light_inside(field, *_middle(sample)), field.radius)
+    if wings is None:
+        if normalise != 'auto':
+            msg = f"normalise='curve-of-growth' {why_not}"
+            raise ValueError(msg)
+        _LOG.info('the light beyond the stamps is not in the PSF: to measure '
+                  'it %s', why_not)
+        return field
+    if normalise == 'auto' and not wings.is_seen:
+        _LOG.info('stars show no light beyond their stamps, %.4f of the flux '
+                  'at most: the PSF is that of the stamps',
+                  wings.share + wings.error)
+        return replace(field, wing_error=float(np.hypot(wings.share,
+                                                        wings.error)))
     if wings.share == 0:
         warnings.warn(
             "normalise='curve-of-growth' found no light beyond the "
             f'stamps, {wings.error:.4f} of the flux at most; nothing was '
             'added', AstropyUserWarning, stacklevel=3)
+    _LOG.info('%.4f +- %.4f of the light of stars is beyond their stamps; it '
+              'is in the PSF as one wide Gaussian, and in fluxes',
+              wings.share, wings.error)
     new = field.stars.copy()
     new['flux_fit'] = new['flux_fit'] / (1 - wings.share)
     return replace(field, stars=new, wing_share=wings.share,
                    wing_stddev=wings.stddev, wing_error=wings.error)
-
-
-def _left(field, flux):
-    """Return the light the Gaussians leave in the stamps, over the flux."""
-    residual = field.residual_stars[np.asarray(field.stars['used'])]
-    # Deviant pixels count as what they would be without.
-    light = np.nanmean(residual, axis=(1, 2)) * np.count_nonzero(
-        np.isfinite(residual).any(axis=0))
-    return np.sum(flux * light) / np.sum(flux**2)
 
 
 def _free(problem, n_components, degree, top, workers, strength, reject):
@@ -262,8 +339,11 @@ def _free(problem, n_components, degree, top, workers, strength, reject):
         strength, workers)
     problem.basis = np.ascontiguousarray(
         problem.basis[:, :stages.n_terms(degree)])
-    return stages.run(problem, n_components, degree, workers,
-                      strength=strength, reject=reject), choice
+    fit = stages.run(problem, n_components, degree, workers,
+                     strength=strength, reject=reject)
+    if problem.pixel_integrated:
+        stages.allow_for_misfit(fit, misfit(fit), workers)
+    return fit, choice
 
 
 def _number(value, name, minimum):
@@ -309,20 +389,74 @@ def _tuned(fit, sample, start, radius, centre):
         sample.dropped(), stddev, fit.problem.pixel_integrated, unmodelled)
 
 
-def _result(fit, sample, radius, choice, centre):
+def _result(fit, sample, radius, choice, centre, fatter):
     sample = sample.without_deviant(fit.problem.used)
     covariance, unmodelled = honest_covariance(fit)
+    n_terms = len(fit.coefficients) - fit.problem.n_extra
     field = MixtureField(
-        fit.coefficients, sample.shape, radius, covariance, None,
+        fit.coefficients[:n_terms], sample.shape, radius, covariance, None,
         residual_stars(fit), fit.accuracy, sample.dropped(), choice,
         _exposure_table(fit, len(sample.reasons)),
-        pixel_integrated=fit.problem.pixel_integrated, unmodelled=unmodelled)
+        pixel_integrated=fit.problem.pixel_integrated, unmodelled=unmodelled,
+        brighter_fatter=_fatter_table(fatter),
+        **_context_parts(fit, sample, n_terms))
     middle = field.mixture_at(*_middle(sample))
     if not field.pixel_integrated:
         warn_of_phase(middle)
     stddev = _centre_stddev(middle, radius, centre, field.pixel_integrated)
-    return replace(field, stars=star_table(fit, sample, stddev),
-                   centre_stddev=stddev)
+    table = star_table(fit, sample, stddev)
+    if centre == 'catalogue':
+        field = _moved(field, table, fit, core_width(middle))
+    return replace(field, stars=table, centre_stddev=stddev)
+
+
+def _context_parts(fit, sample, n_terms):
+    """Return what a field knows of contexts."""
+    if sample.contexts is None:
+        return {}
+    found = fit.coefficients[n_terms:]
+    found = found.reshape(len(sample.contexts.names), -1, *found.shape[1:])
+    return {'contexts': sample.contexts.to_table(),
+            'context_coefficients': found,
+            'lateral_shifts': np.zeros((*found.shape[:2], 2))}
+
+
+def _moved(field, table, fit, width):
+    """
+    Return the field whose light moves with contexts.
+
+    The positions in the table of stars follow.
+    """
+    problem = fit.problem
+    signal = np.sqrt(np.sum(problem.weights * model_stamps(
+        problem, fit.coefficients) ** 2, axis=(1, 2)))
+    # The error of a Gaussian's position, which is its width over signal to
+    # noise.
+    errors = width / gaussian_sigma_to_fwhm / np.maximum(signal, 1e-3)
+    offsets = np.column_stack([table['x_fit'] - table['x'],
+                               table['y_fit'] - table['y']])
+    used = problem.used
+    smooth = problem.basis[:, :len(field.coefficients)]
+    found = lateral_shifts(offsets[used], errors[used], smooth[used],
+                           problem.extra[used])
+    for name, shift in zip(('x_fit', 'y_fit'), (problem.extra @ found).T,
+                           strict=True):
+        table[name] -= shift
+    return replace(field, lateral_shifts=found.reshape(
+        field.lateral_shifts.shape))
+
+
+def _fatter_table(fatter):
+    if fatter is None:
+        return None
+    errors = np.sqrt(np.diag(fatter.covariance))
+    table = QTable()
+    for name, value, error in zip(('xx', 'xy', 'yy'), fatter.value, errors,
+                                  strict=True):
+        table[name], table[f'{name}_err'] = [value], [error]
+    table['significance'] = [fatter.significance]
+    table['largest'] = [fatter.largest]
+    return table
 
 
 def _middle(sample):
@@ -341,13 +475,13 @@ def _centre_stddev(mixture, radius, centre, integrated):
 
 
 def _exposure_table(fit, n):
-    if fit.blur_matrix is None:
+    if fit.blur_covariance is None:
         return None
     # The last exposures may have no star.
     blurs = np.pad(fit.blurs, ((0, n - len(fit.blurs)), (0, 0)))
     errors = np.full((n, 3), np.nan)
-    errors[:len(fit.blurs)] = np.sqrt(np.diag(np.linalg.inv(
-        fit.blur_matrix))).reshape(3, -1).T
+    errors[:len(fit.blurs)] = np.sqrt(np.diag(
+        fit.blur_covariance)).reshape(3, -1).T
     table = QTable({'exposure': np.arange(n)})
     for name, value, error in zip(('xx', 'xy', 'yy'), blurs.T, errors.T,
                                   strict=True):

@@ -10,12 +10,17 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.choice import DEGREES, n_folds
+from photutils_mgauss.field.contexts import Contexts, context_terms
 from photutils_mgauss.field.forms import FreeShapes
 from photutils_mgauss.field.normal import FieldProblem
 from photutils_mgauss.field.stamps import Stamps, cut_stamps, remove_star_noise
 from photutils_mgauss.utils.correlated_noise import noise_correlation
 from photutils_mgauss.utils.image import read_pixels
-from photutils_mgauss.utils.star_columns import read_sources
+from photutils_mgauss.utils.star_columns import (
+    check_table,
+    column_values,
+    read_sources,
+)
 
 # Neighbours may be this far off their catalogue positions [pix].
 _NEIGHBOUR_STDDEV = 0.5
@@ -53,6 +58,10 @@ class Sample:
         What the noise of neighbouring pixels of each exposure has in common.
     growth : (E,) `~numpy.ndarray`
         By how much the variances in ``stamps`` are larger for it.
+    values : (n, C) `~numpy.ndarray`
+        The contexts of each star, NaN where unknown.
+    contexts : Contexts or None
+        Their scales, if there are any.
     """
 
     stamps: Stamps
@@ -66,6 +75,8 @@ class Sample:
     unit: object
     correlations: list
     growth: np.ndarray
+    values: np.ndarray
+    contexts: Contexts | None
 
     def expected(self):
         """Return x and y (n,) of the stars in their tables."""
@@ -75,16 +86,18 @@ class Sample:
 
     def problem(self, degree, local_bkg):
         """Return the problem of a field with polynomials of a degree."""
-        x, y = self.expected()
-        basis = stages.polynomials(*normalised(x, y, self.shape), degree)
+        places = normalised(*self.expected(), self.shape)
+        basis = stages.polynomials(*places, degree)
         hold = np.full(self.sources.shape, _NEIGHBOUR_STDDEV**-2.0)
         hold[..., 2] = 1 / np.maximum(self.sources[..., 2] ** 2, 1e-300)
-        n = len(x)
+        n = len(basis)
+        extra = np.zeros((n, 0)) if self.contexts is None else context_terms(
+            self.contexts.scaled(self.values), *places, degree)
         return FieldProblem(
             self.stamps, np.zeros(self.stamps.data.shape), basis, self.sources,
             self.sources.copy(), hold, self.count, np.zeros(n),
             bool(local_bkg), np.ones(n, bool), self.exposure, FreeShapes(),
-            np.zeros((n, 3)))
+            np.zeros((n, 3)), extra)
 
     def without_deviant(self, used):
         """Return the sample in which the stars not used (n,) are deviant."""
@@ -112,7 +125,7 @@ def normalised(x, y, shape):
             2 * np.asarray(y, float) / max(ny - 1, 1) - 1)
 
 
-def read_sample(data, stars, error, mask, radius, gain):
+def read_sample(data, stars, error, mask, radius, gain, contexts=()):
     """Check the exposures, cut their stars out, and say who is left out."""
     if gain is not None and not (isinstance(gain, Real) and gain > 0):
         msg = (f'effective_gain must be None or a number greater than 0, got '
@@ -121,6 +134,9 @@ def read_sample(data, stars, error, mask, radius, gain):
     exposures = list(read_exposures(data, stars, error, mask))
     parts = [_read_one(pixels, table, radius, gain)
              for pixels, table in exposures]
+    values = np.concatenate([
+        _context_values(table, contexts)[part[1]]
+        for (_, table), part in zip(exposures, parts, strict=True)])
     stamps = Stamps.joined([part[0] for part in parts])
     if not len(stamps.data):
         msg = (f'stars must hold at least 1 star whose pixels can be used, '
@@ -140,7 +156,15 @@ def read_sample(data, stars, error, mask, radius, gain):
         [part[2] for part in parts], exposures[0][0].unit,
         [_correlation(pixels, part[2], radius)
          for (pixels, _), part in zip(exposures, parts, strict=True)],
-        np.ones(len(parts)))
+        np.ones(len(parts)), values,
+        Contexts.of_stars(contexts, values) if contexts else None)
+
+
+def _context_values(table, names):
+    """Return the columns of contexts (n, C), NaN where unknown."""
+    check_table(table, 'stars', names)
+    columns = [column_values(table, name) for name in names]
+    return np.array(columns).reshape(len(names), len(table)).T
 
 
 def _correlation(pixels, sources, radius):

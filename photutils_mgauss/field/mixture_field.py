@@ -13,16 +13,24 @@ and all stars are fitted together, each with its own position and flux. No
 pixel is resampled on the way, and the variance is that of the model.
 """
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import Field, lattice
-from photutils_mgauss.field.covariance import psf_errors
+from photutils_mgauss.field.contexts import Contexts, context_terms
+from photutils_mgauss.field.covariance import (
+    psf_errors,
+    shape_covariance,
+    slopes,
+)
 from photutils_mgauss.field.forms import convolved, mixture_arrays
+from photutils_mgauss.field.growth import left_over
 from photutils_mgauss.field.input import normalised
 from photutils_mgauss.files.storage import storable, table_columns
+from photutils_mgauss.psf.contexts import PSFContext, known_contexts
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
@@ -30,9 +38,23 @@ from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 __all__ = ['MixtureField']
 
 
-# Of numerical derivatives.
-_STEP = 1e-4
 _WINGS = 'wing_share', 'wing_error', 'wing_stddev'
+_TABLES = 'exposures', 'contexts', 'brighter_fatter'
+# Between as many values of each context, to either side of the usual one, a
+# grid blends.
+_LAYERS = 2
+
+
+class _Kind(NamedTuple):
+    """
+    Which stars a PSF is of.
+
+    contexts (C,) are scaled, blur (1, 3) is what exposure and flux add to
+    the covariances, or None.
+    """
+
+    contexts: np.ndarray
+    blur: np.ndarray | None
 
 
 @storable(detector={'ny': 'pix', 'nx': 'pix', 'radius': 'pix',
@@ -62,8 +84,9 @@ class MixtureField(Field):
     radius : float
         The radius of the stamps [pix].
     covariance : (N, N) `~numpy.ndarray`
-        The covariance of the N = (6 K - 3) T fitted coefficients, shape by
-        shape and term by term within a shape. The first three shapes of the
+        The covariance of the N = (6 K - 3) (T + C X) fitted coefficients,
+        shape by shape and term by term within a shape, those of contexts
+        behind the others. The first three shapes of the
         first Gaussian are not fitted. What ``unmodelled`` does to the stars
         that were fitted is in it.
     stars : `~astropy.table.QTable`
@@ -84,7 +107,8 @@ class MixtureField(Field):
     exposures : `~astropy.table.QTable`, optional
         If the stars are from several exposures, the covariance that each
         one adds to all Gaussians, ``xx``, ``xy``, ``yy`` [pix^2], about the
-        mean of all, and its errors ``xx_err``, ``xy_err``, ``yy_err``.
+        mean of all, and its errors ``xx_err``, ``xy_err``, ``yy_err``. That
+        of a single one is part of the PSF.
     centre_stddev : float, optional
         The size w of the Gaussian weight under which the PSF's first moment
         about its origin vanishes [pix]; infinite, the default, where the
@@ -100,6 +124,21 @@ class MixtureField(Field):
         the stamps, and its error; 0 unless that was measured.
     wing_stddev : float, optional
         The size of that Gaussian [pix].
+    contexts : `~astropy.table.QTable`, optional
+        What shapes depend on beside position: ``name`` of the column of a
+        table of stars, ``mean``, ``stddev``, ``low`` and ``high`` of the
+        stars. Stars beyond ``low`` and ``high`` are as those there.
+    context_coefficients : (C, X, K, 6) `~numpy.ndarray`, optional
+        What the shapes change by for each standard deviation of each of the
+        C contexts, times the first X = 1 or 3 terms.
+    lateral_shifts : (C, X, 2) `~numpy.ndarray`, optional
+        How far in x and y the light is moved for it [pix].
+    brighter_fatter : `~astropy.table.QTable`, optional
+        If bright stars are wider, one row: the covariance that each unit of
+        flux adds to all Gaussians, ``xx``, ``xy``, ``yy`` [pix^2], their
+        errors ``xx_err``, ``xy_err``, ``yy_err``, the ``significance``, a
+        chi^2 with three degrees of freedom, and the ``largest`` flux of the
+        stars. The other numbers are then those of faint stars.
 
     Examples
     --------
@@ -137,6 +176,10 @@ class MixtureField(Field):
     wing_share: float = 0.0
     wing_error: float = 0.0
     wing_stddev: float = 0.0
+    contexts: QTable = field(default=None)
+    context_coefficients: np.ndarray = None
+    lateral_shifts: np.ndarray = None
+    brighter_fatter: QTable = field(default=None)
 
     def __repr__(self):
         return self._described(f'n_components={self.n_components}, ')
@@ -158,8 +201,12 @@ class MixtureField(Field):
                 'terms': {'coefficient': self.coefficients},
                 'errors': {'covariance': self.covariance},
                 'stars': stars, 'dropped': table_columns(dropped)}
-        if self.exposures is not None:
-            tables['exposures'] = table_columns(self.exposures)
+        for name in _TABLES:
+            if getattr(self, name) is not None:
+                tables[name] = table_columns(getattr(self, name))
+        if self.contexts is not None:
+            tables['contexts'] |= {'coefficient': self.context_coefficients,
+                                   'shift': self.lateral_shifts}
         if self.unmodelled is not None:
             tables['unmodelled'] = {'variance': self.unmodelled}
         return tables
@@ -171,28 +218,42 @@ class MixtureField(Field):
         covariance = tables['errors']['covariance']
         n_terms, n = len(coefficients), len(covariance)
         residual = stars.pop('residual', None)
-        exposures = (QTable(tables['exposures']) if 'exposures' in tables
-                     else None)
         # Files once held no PSF of optics, and no centre other than that of
         # the flux.
         integrated = bool(detector.get('pixel_integrated', [False])[0])
         stddev = float(detector.get('centre_stddev', [np.inf])[0])
-        return cls(coefficients.reshape(n_terms, -1, 6),
-                   (int(detector['ny'][0]), int(detector['nx'][0])),
-                   float(detector['radius'][0]), covariance.reshape(n, n),
-                   QTable(stars), residual, float(detector['accuracy'][0]),
-                   QTable(tables['dropped']), exposures=exposures,
-                   centre_stddev=stddev, pixel_integrated=integrated,
-                   unmodelled=tables.get('unmodelled', {}).get('variance'),
-                   **{name: float(detector.get(name, [0.0])[0])
-                      for name in _WINGS})
+        found = cls(
+            coefficients.reshape(n_terms, -1, 6),
+            (int(detector['ny'][0]), int(detector['nx'][0])),
+            float(detector['radius'][0]), covariance.reshape(n, n),
+            QTable(stars), residual, float(detector['accuracy'][0]),
+            QTable(tables['dropped']), centre_stddev=stddev,
+            pixel_integrated=integrated,
+            unmodelled=tables.get('unmodelled', {}).get('variance'),
+            **{name: float(detector.get(name, [0.0])[0]) for name in _WINGS})
+        return replace(found, **found._tables_of(tables))
+
+    def _tables_of(self, tables):
+        """Return what a file holds of exposures, contexts and fluxes."""
+        kept = {name: dict(tables[name]) for name in _TABLES
+                if name in tables}
+        arrays = {}
+        if 'contexts' in kept:
+            n = len(kept['contexts']['name'])
+            coefficients, shifts = (kept['contexts'].pop(name)
+                                    for name in ('coefficient', 'shift'))
+            arrays = {'context_coefficients': coefficients.reshape(
+                n, -1, self.n_components, 6),
+                'lateral_shifts': shifts.reshape(n, -1, 2)}
+        return {name: QTable(columns) for name, columns in kept.items()
+                } | arrays
 
     @property
     def n_components(self):
         """The number K of Gaussians."""
         return self.coefficients.shape[1]
 
-    def mixture_at(self, x, y, *, exposure=None):
+    def mixture_at(self, x, y, *, exposure=None, flux=None, **contexts):
         """
         Return the PSF at a detector position.
 
@@ -202,6 +263,12 @@ class MixtureField(Field):
             The position [pix].
         exposure : int, optional
             The exposure, from 0; by default the mean of all.
+        flux : float, optional
+            That of the star, where bright stars are wider; by default that
+            of a faint one.
+        **contexts : float, optional
+            What the field depends on beside position, as ``colour=0.7``; by
+            default the mean of the stars that it was fitted to.
 
         Returns
         -------
@@ -215,19 +282,108 @@ class MixtureField(Field):
             If an argument is not valid.
         """
         x, y = as_real(x, 'x'), as_real(y, 'y')
-        weights, means, covariances, _ = self._mixtures([x], [y], exposure)
+        kind = self._kind(exposure, flux, contexts)
+        weights, means, covariances, _ = self._mixtures([x], [y], kind)
         return GaussianMixture(weights[0], means[0], covariances[0])
 
-    def _mixtures(self, x, y, exposure, change=None):
+    def at_exposure(self, exposure):
+        """
+        Return the field of one exposure.
+
+        Parameters
+        ----------
+        exposure : int
+            Its number, from 0.
+
+        Returns
+        -------
+        MixtureField
+            With the PSF and the stars of that exposure alone.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If there is no such exposure.
+        """
+        self._blur(exposure)
+        if self.exposures is None:
+            return self
+        rows = np.asarray(self.stars['exposure']) == exposure
+        residual = self.residual_stars
+        return replace(self, exposures=self.exposures[exposure:exposure + 1],
+                       stars=self.stars[rows],
+                       residual_stars=residual if residual is None
+                       else residual[rows])
+
+    def _kind(self, exposure=None, flux=None, contexts=None):
+        """Return the `_Kind` that is asked for."""
+        blur = None
+        if exposure is not None or (self.exposures is not None
+                                    and len(self.exposures) == 1):
+            blur = self._blur(exposure or 0)
+        if flux is not None:
+            fatter = as_real(flux, 'flux') * self._fattening()
+            blur = fatter if blur is None else blur + fatter
+        names = [] if self.contexts is None else list(self.contexts['name'])
+        values = known_contexts(contexts or {}, names)
+        return _Kind(self._scaled([values.get(name, np.nan)
+                                   for name in names]), blur)
+
+    def _scaled(self, values):
+        """Return values (C,) of contexts in standard deviations."""
+        if self.contexts is None:
+            return np.zeros(0)
+        return Contexts.of_table(self.contexts).scaled(np.array(values, float))
+
+    def _fattening(self):
+        """Return what a unit of flux adds to the covariances, (1, 3)."""
+        if self.brighter_fatter is None:
+            return np.zeros((1, 3))
+        row = self.brighter_fatter[0]
+        return np.array([[row[name] for name in ('xx', 'xy', 'yy')]])
+
+    def _mixtures(self, x, y, kind, change=None):
         """Return stacked weights, means, covariances and shifts."""
-        shapes = np.einsum('nt,tki->nki', self._basis(x, y),
-                           self.coefficients)
+        shapes = np.einsum('nt,tki->nki', self._basis(x, y, kind),
+                           self._all_coefficients())
+        blur = kind.blur
         if change is not None:
-            shapes.reshape(len(shapes), -1)[:, 3:] += change
-        if exposure is not None:
-            shapes = convolved(shapes, self._blur(exposure))
-        mixtures = mixture_arrays(shapes, self.centre_stddev)
+            flat = shapes.reshape(len(shapes), -1)[:, 3:]
+            flat += change[:flat.shape[1]]
+            more = change[flat.shape[1]:]
+            blur = blur + more if more.size else blur
+        if blur is not None:
+            shapes = convolved(shapes, blur)
+        weights, means, covariances, shift = mixture_arrays(
+            shapes, self.centre_stddev)
+        if kind.contexts.any():
+            means = means + self._lateral(x, y, kind)[:, None]
+        mixtures = weights, means, covariances, shift
         return self._with_wings(*mixtures) if self.wing_share else mixtures
+
+    def _all_coefficients(self):
+        if self.contexts is None:
+            return self.coefficients
+        return np.concatenate([self.coefficients, np.concatenate(
+            self.context_coefficients)])
+
+    def _basis(self, x, y, kind):
+        """Return the terms of all coefficients, (n, T + C X)."""
+        places = normalised(x, y, self.shape)
+        basis = stages.polynomials(*places, self.degree)
+        if self.contexts is None:
+            return basis
+        return np.hstack([basis, self._context_terms(places, kind)])
+
+    def _context_terms(self, places, kind):
+        degree = 1 if self.lateral_shifts.shape[1] > 1 else 0
+        scaled = np.tile(kind.contexts, (len(places[0]), 1))
+        return context_terms(scaled, *places, degree)
+
+    def _lateral(self, x, y, kind):
+        """Return how far light is moved for its contexts, (n, 2)."""
+        terms = self._context_terms(normalised(x, y, self.shape), kind)
+        return terms @ np.concatenate(self.lateral_shifts)
 
     def _with_wings(self, weights, means, covariances, shift):
         """Add the Gaussian of the light beyond the stamps."""
@@ -241,8 +397,10 @@ class MixtureField(Field):
         """
         Return the standard deviation of `aperture_correction`.
 
-        It holds the noise of the fitted shapes and, if the light beyond the
-        stamps was measured, ``wing_error``.
+        It holds the noise of the fitted shapes, what they do beyond the
+        polynomials, the light that the Gaussians leave of the stars inside
+        the radius and, if the light beyond the stamps was measured,
+        ``wing_error``.
 
         Parameters
         ----------
@@ -261,27 +419,34 @@ class MixtureField(Field):
             If the radius is not a positive number.
         """
         correction = self.aperture_correction(radius, x, y)
-        basis = stages.polynomials(*normalised([x], [y], self.shape),
-                                   self.degree)[0]
-        # All shapes are changed by their constant terms.
-        first = (np.arange(len(basis)) == 0)[:, None, None]
-        slopes = []
-        for shape in range(3, 6 * self.n_components):
-            change = np.zeros(6 * self.n_components)
-            change[shape] = _STEP
-            ends = [replace(self, coefficients=self.coefficients
-                            + sign * first * change.reshape(1, -1, 6)
-                            ).aperture_correction(radius, x, y)
-                    for sign in (1, -1)]
-            slopes.append((ends[0] - ends[1]) / (2 * _STEP))
-        slope = np.outer(slopes, basis).ravel()
-        shapes = slope @ self.covariance @ slope
-        return float(np.sqrt(shapes + (correction * self.wing_error) ** 2))
+        x, y, kind = [as_real(x, 'x')], [as_real(y, 'y')], self._kind()
 
-    def _basis(self, x, y):
-        return stages.polynomials(*normalised(x, y, self.shape), self.degree)
+        def change_to(change):
+            parts = self._mixtures(x, y, kind, change)[:3]
+            return 1 / GaussianMixture(*(part[0] for part in parts)
+                                       ).encircled_energy(radius)
+        slope = slopes(change_to, self._unmodelled().size)
+        shapes = slope @ shape_covariance(
+            self.covariance, self._unmodelled(), self._basis(x, y, kind)
+            )[0] @ slope
+        misfit = correction - self._corrected(radius, 1 / correction)
+        return float(np.sqrt(shapes + (correction * self.wing_error) ** 2
+                             + misfit**2))
 
-    def psf_errors(self, *, exposure=None):
+    def _corrected(self, radius, inside):
+        """Return the aperture correction that the stars' pixels ask for."""
+        if self.residual_stars is None:
+            return 1 / inside
+        left, total = (left_over(self, one)[0] for one in (radius,
+                                                           self.radius))
+        return (1 + total) / max(inside + left, 1e-3)
+
+    def _unmodelled(self):
+        if self.unmodelled is None:
+            return np.zeros(6 * self.n_components - 3)
+        return self.unmodelled
+
+    def psf_errors(self, *, exposure=None, flux=None, **contexts):
         """
         Return how far the PSF may be off, for what is measured with it.
 
@@ -291,21 +456,29 @@ class MixtureField(Field):
 
         Parameters
         ----------
-        exposure : int, optional
-            The exposure, from 0; by default the mean of all.
+        exposure, flux, **contexts : optional
+            Of which PSF, see `mixture_at`.
 
         Returns
         -------
         PSFErrors
         """
-        unmodelled = self.unmodelled
-        if unmodelled is None:
-            unmodelled = np.zeros(6 * self.n_components - 3)
+        kind = self._kind(exposure, flux, contexts)
         return psf_errors(
-            lambda x, y, change: (self._basis(x, y), *self._mixtures(
-                x, y, exposure, change)[:3]),
-            self.covariance, unmodelled, self.degree, self.shape,
-            self.pixel_integrated)
+            lambda x, y, change: (self._basis(x, y, kind), *self._mixtures(
+                x, y, kind, change)[:3]),
+            self.covariance, self._unmodelled(), self.degree, self.shape,
+            self.pixel_integrated, self._blur_variance(exposure),
+            self.accuracy if self.pixel_integrated else 0.0)
+
+    def _blur_variance(self, exposure):
+        """Return the variances (3,) of what an exposure adds, if any."""
+        if self.exposures is None or (exposure is None
+                                      and len(self.exposures) > 1):
+            return []
+        row = self.exposures[exposure or 0]
+        return np.nan_to_num([row[f'{name}_err']**2
+                              for name in ('xx', 'xy', 'yy')])
 
     def _blur(self, exposure):
         n = 1 if self.exposures is None else len(self.exposures)
@@ -317,7 +490,8 @@ class MixtureField(Field):
         row = self.exposures[exposure]
         return np.array([[row[name] for name in ('xx', 'xy', 'yy')]])
 
-    def to_grid(self, grid_shape=(30, 30), *, exposure=None):
+    def to_grid(self, grid_shape=(30, 30), *, exposure=None, flux=None,
+                **contexts):
         """
         Return the field sampled on a grid, as a model for photutils.
 
@@ -326,8 +500,10 @@ class MixtureField(Field):
         grid_shape : int or (int, int), optional
             The number of nodes along y and x. They reach from the first
             pixel to the last.
-        exposure : int, optional
-            The exposure, from 0; by default the mean of all.
+        exposure, flux, **contexts : optional
+            Of which PSF, see `mixture_at`. Of flux and contexts that are not
+            given, the grid knows what they do, as its ``contexts``, and
+            `MixturePSFPhotometry` takes it into account.
 
         Returns
         -------
@@ -339,10 +515,40 @@ class MixtureField(Field):
         TypeError, ValueError
             If an argument is not valid.
         """
-        x, y = lattice(as_shape(grid_shape, 'grid_shape'), self.shape)
-        arrays = self._mixtures(x, y, exposure)[:3]
-        mixtures = [GaussianMixture(*one) for one in zip(*arrays,
-                                                         strict=True)]
-        return GriddedMixturePSF(mixtures, np.column_stack([x, y]),
-                                 pixel_integrated=self.pixel_integrated,
-                                 errors=self.psf_errors(exposure=exposure))
+        nodes = list(lattice(as_shape(grid_shape, 'grid_shape'), self.shape))
+        given = {'flux': flux, **contexts}
+
+        def grid(kind, **options):
+            mixtures = [GaussianMixture(*one) for one in zip(
+                *self._mixtures(*nodes, kind)[:3], strict=True)]
+            return GriddedMixturePSF(
+                mixtures, np.column_stack(nodes),
+                pixel_integrated=self.pixel_integrated, **options)
+
+        def context(name, values, usual):
+            layers = [grid(self._kind(exposure, **_asked(
+                given | {name: value}))) for value in values]
+            return PSFContext(name, np.array(values), usual, tuple(layers))
+        kind = self._kind(exposure, flux, contexts)
+        return grid(kind, errors=self.psf_errors(exposure=exposure, **given),
+                    contexts=[context(*one) for one in self._free_contexts(
+                        contexts, flux)])
+
+    def _free_contexts(self, contexts, flux):
+        """Yield name, values and usual value of contexts not given."""
+        for name, mean, low, high in (
+                () if self.contexts is None else self.contexts.iterrows(
+                    'name', 'mean', 'low', 'high')):
+            if name not in contexts:
+                yield str(name), np.concatenate([
+                    np.linspace(low, mean, _LAYERS, endpoint=False), [mean],
+                    np.linspace(high, mean, _LAYERS, endpoint=False)[::-1]
+                ]), mean
+        if self.brighter_fatter is not None and flux is None:
+            yield 'flux', [0.0, float(self.brighter_fatter['largest'][0])], 0.0
+
+
+def _asked(values):
+    """Return flux and contexts as arguments of a kind."""
+    return {'flux': values['flux'], 'contexts': {
+        name: value for name, value in values.items() if name != 'flux'}}

@@ -56,7 +56,8 @@ class FieldProblem:
     weights : (n, s, s) `~numpy.ndarray`
         One over the variance; 0 for pixels left out.
     basis : (n, T) `~numpy.ndarray`
-        The polynomials at each star.
+        The polynomials at each star; while it is fitted with them, the terms
+        of ``extra`` behind them.
     sources, anchors, hold : (n, M, 3) `~numpy.ndarray`
         x, y and flux of each star and its neighbours, where the neighbours
         are expected, and the precision of that.
@@ -70,6 +71,8 @@ class FieldProblem:
         What the polynomials mean.
     local : (n, ...) `~numpy.ndarray`
         What the form needs to know of each star.
+    extra : (n, X) `~numpy.ndarray`
+        Terms that do not depend on the degree, as those of colours.
     pixel_integrated : bool
         Whether the shapes are integrated over pixels, not sampled.
     """
@@ -87,14 +90,25 @@ class FieldProblem:
     exposure: np.ndarray
     form: object
     local: np.ndarray
+    extra: np.ndarray
     pixel_integrated: bool = False
+
+    @property
+    def n_extra(self):
+        """The number of terms that do not depend on the degree."""
+        return self.extra.shape[1]
+
+    def with_terms(self, n_terms):
+        """Return the problem with the first polynomials and the extra."""
+        return replace(self, basis=np.hstack([self.basis[:, :n_terms],
+                                              self.extra]))
 
     def subset(self, index):
         """Return the problem of some of the stars; nothing is shared."""
         return replace(self, stamps=self.stamps.subset(index), **{
             name: getattr(self, name)[index] for name in
             ('weights', 'basis', 'sources', 'anchors', 'hold', 'n_sources',
-             'sky', 'used', 'exposure', 'local')})
+             'sky', 'used', 'exposure', 'local', 'extra')})
 
     def shapes(self, coefficients):
         """Return the shapes of the PSF at each star, (n, K, 6)."""
@@ -218,24 +232,28 @@ class Prior:
 
     Both have the shape of the coefficients, (T, K, 6) or (T, N).
 
-    The terms a lower degree does not have are the last ones. Mixtures' mean
-    sizes meet a wall at ``widest`` [pix].
+    The terms a lower degree does not have are the last ones before the
+    ``n_extra`` that all have. Mixtures' mean sizes meet a wall at ``widest``
+    [pix].
     """
 
     mean: np.ndarray
     precision: np.ndarray
     strength: float = 1.0
     widest: float = np.inf
+    n_extra: int = 0
 
     @classmethod
-    def about(cls, shapes, n_terms, width, strength=1.0, widest=np.inf):
+    def about(cls, shapes, n_terms, width, strength=1.0, widest=np.inf,
+              n_extra=0):
         """Return the prior about the constant shapes (K, 6)."""
+        n_terms += n_extra
         mean = np.zeros((n_terms, *shapes.shape))
         mean[0] = shapes
         scale = np.array([1, width, width, 1, 1, 1])
         stddev = np.tile(_PRIOR_VARIATION * scale, (n_terms, len(shapes), 1))
         stddev[0] = _PRIOR_CONSTANT * scale
-        return cls(mean, strength / stddev**2, strength, widest)
+        return cls(mean, strength / stddev**2, strength, widest, n_extra)
 
     @classmethod
     def of_changes(cls, n_terms, width, strength=1.0):
@@ -246,9 +264,10 @@ class Prior:
         return cls(np.zeros((n_terms, 6)), strength / stddev**2, strength)
 
     def first(self, n_terms):
-        """Return the prior of the first terms."""
-        return replace(self, mean=self.mean[:n_terms],
-                       precision=self.precision[:n_terms])
+        """Return the prior of the first terms, and of the extra ones."""
+        kept = np.r_[:n_terms, len(self.mean) - self.n_extra:len(self.mean)]
+        return replace(self, mean=self.mean[kept],
+                       precision=self.precision[kept])
 
     def adapted(self, coefficients, matrix, groups):
         r"""

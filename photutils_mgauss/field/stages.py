@@ -60,8 +60,10 @@ class FieldFit:
     deviant_pixels : (n, s, s) `~numpy.ndarray` of bool
     blurs : (E, 3) `~numpy.ndarray`
         The covariance xx, xy, yy that each exposure adds [pix^2].
-    blur_matrix : (3 E, 3 E) `~numpy.ndarray` or None
-        Their normal equations, if there are several exposures.
+    blur_covariance : (3 E, 3 E) `~numpy.ndarray` or None
+        Their errors, by number, then exposure, if there are several.
+    fattening : (3,) `~numpy.ndarray` or None
+        The covariance that each unit of flux adds [pix^2], if that is fitted.
     """
 
     problem: FieldProblem
@@ -71,7 +73,21 @@ class FieldFit:
     accuracy: float
     deviant_pixels: np.ndarray
     blurs: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
-    blur_matrix: np.ndarray = None
+    blur_covariance: np.ndarray = None
+    fattening: np.ndarray = None
+
+    def added(self):
+        """Return what is added to the covariances of each star, (n, 3)."""
+        added = self.blurs[self.problem.exposure]
+        if self.fattening is not None:
+            added = added + self.fluxes()[:, None] * self.fattening
+        return added
+
+    def fluxes(self):
+        """Return the fluxes (n,) of the stars, for weights that sum to 1."""
+        shapes = self.problem.shapes(self.coefficients)
+        return (self.problem.sources[:, 0, 2]
+                * np.exp(shapes[..., 0]).sum(axis=1))
 
 
 def n_terms(degree):
@@ -356,7 +372,9 @@ def degrees(problem, n_components, top, strength, workers):
 def _first_state(problem, n_components, degree, strength, workers):
     start, shapes, width = begin(problem, n_components, strength, workers)
     prior = Prior.about(shapes, n_terms(degree), width, strength,
-                        _widest(problem))
+                        _widest(problem), problem.n_extra)
+    start = np.concatenate([start, np.zeros((problem.n_extra,
+                                             *shapes.shape))])
     return FieldFit(problem, start, prior, None, _FIRST_ACCURACY,
                     np.zeros(problem.stamps.good.shape, bool),
                     np.zeros((problem.exposure.max() + 1, 3)))
@@ -369,12 +387,11 @@ def _stage(state, index, degree, workers, reject, *, adapt=False):
     Only coefficients remain in ``state``; the fit itself is returned.
     """
     terms = n_terms(degree)
-    few = state.problem.subset(index)
-    few.basis = np.ascontiguousarray(few.basis[:, :terms])
-    part = FieldFit(few, _raised(state.coefficients, terms),
+    few = state.problem.subset(index).with_terms(terms)
+    part = FieldFit(few, _raised(state.coefficients, terms, few.n_extra),
                     state.prior.first(terms), None, state.accuracy,
                     np.zeros(few.stamps.good.shape, bool), state.blurs)
-    few.local = state.blurs[few.exposure]
+    few.local = part.added()
     _settle_all(part, workers)
     for _ in range(2):
         _fit_blurs(part, workers)
@@ -389,25 +406,39 @@ def _stage(state, index, degree, workers, reject, *, adapt=False):
 
 def _fit_blurs(state, workers):
     """
-    Fit what each exposure adds to the covariances, the field given.
+    Fit what each exposure adds to the covariances, all else given.
 
     Their mean belongs to the field.
     """
     problem, n = state.problem, len(state.blurs)
     if n < 2:
+        if state.fattening is not None:
+            problem.local = state.added()
         return
-    problem.local[:] = 0
-    shapes = problem.shapes(state.coefficients)
-    tuned = replace(problem, form=TunedShapes(), basis=np.eye(n)[
-        problem.exposure], local=TunedShapes.local(shapes, 1.0))
-    width = np.exp(-shapes[:, 0, [3, 5]].mean())
+    tuned = added_shapes(state)
+    width = np.exp(-tuned.local[:, 0, [3, 5]].mean())
     prior = Prior(np.zeros((n, 3)), np.full((n, 3), width**-4.0))
     blurs, found = optimise(tuned, state.blurs, prior, workers, max_steps=10,
                             tolerance=0.03)
     state.blurs = blurs - blurs.mean(axis=0)
-    state.blur_matrix = found.matrix + np.diag(to_vector(prior.precision))
+    state.blur_covariance = np.linalg.inv(found.matrix + np.diag(
+        to_vector(prior.precision)))
     problem.sources, problem.sky = tuned.sources, tuned.sky
-    problem.local = state.blurs[problem.exposure]
+    problem.local = state.added()
+
+
+def added_shapes(state):
+    """
+    Return the problem of what exposures add to the covariances of stars.
+
+    What fluxes add is part of the shapes that are known.
+    """
+    problem, n = state.problem, len(state.blurs)
+    known = replace(problem, local=state.added()
+                    - state.blurs[problem.exposure])
+    return replace(
+        problem, form=TunedShapes(), basis=np.eye(n)[problem.exposure],
+        local=TunedShapes.local(known.shapes(state.coefficients), 1.0))
 
 
 def _settle_all(state, workers):
@@ -431,30 +462,47 @@ def tune(problem, degree, workers, *, strength=1.0, reject=True):
 
 def _finish(state, degree, workers, reject):
     terms = n_terms(degree)
-    state.coefficients = _raised(state.coefficients, terms)
+    state.problem = state.problem.with_terms(terms)
+    state.coefficients = _raised(state.coefficients, terms,
+                                 state.problem.n_extra)
+    return polish(state, workers, reject)
+
+
+def polish(state, workers, reject):
+    """Fit all at the last degree until nothing changes; return the state."""
     _settle_all(state, workers)
     for share, tolerance in ((0.3, 0.3), (0.3, 0.1), (1, 0.01)):
         _fit_blurs(state, workers)
         weigh(state, reject=reject, share=share)
         advance(state, workers, tolerance=tolerance, max_steps=8)
-    for _ in range(_ADAPTATIONS if degree else 0):
+    for _ in range(_ADAPTATIONS if len(state.coefficients) > 1 else 0):
         _adapt(state, workers, reject)
     return state
+
+
+def allow_for_misfit(state, misfit, workers):
+    """Take the light in pixels to be off by this share of it, in place."""
+    if misfit != state.accuracy:
+        state.accuracy = misfit
+        weigh(state, reject=False, share=None)
+        advance(state, workers, tolerance=0.01, max_steps=10)
 
 
 def _adapt(state, workers, reject):
     """Let the prior follow the coefficients, and these the prior."""
     state.prior = state.prior.adapted(
         state.coefficients, state.equations.matrix,
-        _groups(state.coefficients, state.problem.form.kinds))
+        _groups(state.coefficients, state.problem.form.kinds,
+                state.problem.n_extra))
     # A higher error would mean less weight for the cores, and so on upwards.
     weigh(state, reject=reject, share=None)
     advance(state, workers, tolerance=0.01, max_steps=10)
 
 
-def _groups(coefficients, kinds):
-    """Return which coefficients are of one degree and kind."""
-    degrees = term_degrees(len(coefficients))
+def _groups(coefficients, kinds, n_extra):
+    """Return which coefficients are of one degree, or term, and kind."""
+    degrees = term_degrees(len(coefficients) - n_extra)
+    degrees = np.append(degrees, degrees[-1] + 1 + np.arange(n_extra))
     groups = np.empty(coefficients.shape, int)
     groups[:] = kinds
     groups += 3 * (degrees - 1).reshape(-1, *[1] * (groups.ndim - 1))
@@ -465,8 +513,10 @@ def _groups(coefficients, kinds):
     return groups
 
 
-def _raised(coefficients, terms):
+def _raised(coefficients, terms, n_extra):
     """Return the coefficients with further terms of zero."""
-    full = np.zeros((terms, *coefficients.shape[1:]))
-    full[:len(coefficients)] = coefficients
+    known = len(coefficients) - n_extra
+    full = np.zeros((terms + n_extra, *coefficients.shape[1:]))
+    full[:known] = coefficients[:known]
+    full[terms:] = coefficients[known:]
     return full

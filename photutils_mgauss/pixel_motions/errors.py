@@ -117,7 +117,7 @@ def _bias(campaign, solved, rows, covariance):
     return np.minimum(out, 0.5)
 
 
-def frame_covariance(solution, campaign, solved, plain):
+def frame_covariance(solution, campaign, solved, plain, refined=None):
     r"""
     Return what the errors of frames add to covariances, (p, p, n).
 
@@ -130,6 +130,9 @@ def frame_covariance(solution, campaign, solved, plain):
         The frames are those of the WCS of the images.
     campaign, solved, plain
         The images, the stars, and the inverses of their matrices.
+    refined : `~photutils_mgauss.pixel_motions.refine.Frames`, optional
+        Where the pixels have given frames, what is left are those errors
+        that all stars follow, as a map of the plane.
     """
     fit = solution._fit
     epochs = _epochs_of(solution, campaign)
@@ -144,6 +147,8 @@ def frame_covariance(solution, campaign, solved, plain):
         moved = np.einsum('xbq,bn->nxq', factor[e], basis)
         total += _answers(solved, plain, k, np.einsum(
             'nix,nxq->niq', solved.slopes[:, k, :, :2], moved))
+    if refined is not None:
+        total = refined.smooth(solved, total)
     return np.einsum('npq,nrq->prn', total, total)
 
 

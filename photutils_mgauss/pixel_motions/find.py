@@ -6,15 +6,17 @@ out, weighted by the inverse variances of its pixels:
 
 .. math:: n_k = \sum w_k p_k d_k, \quad m_k = \sum w_k p_k^2 .
 
-For a star of the motion v the signal-to-noise ratio of all images is
+For a star of the motion v and parallax :math:`\varpi` the signal-to-noise
+ratio of all images is
 
-.. math:: T_v(x) = \sum_k c_k n_k(x + v t_k) \Big/
+.. math:: T_v(x) = \sum_k c_k n_k(x + v t_k + \varpi p_k) \Big/
     \sqrt{\sum_k c_k^2 m_k},
 
 with the scale :math:`c_k` of each image, from the brightest stars. Maps are
-put on one grid once, and shifted for each motion: time goes with pixels times
-motions. The largest :math:`T_v` of all motions is compared with a threshold
-for a rate of false alarms in pure noise.
+put on one grid once, and shifted for each motion and parallax, with the
+parallax factors :math:`p_k` of the middle of the field: time goes with pixels
+times motions. The largest :math:`T_v` of all motions is compared with a
+threshold for a rate of false alarms in pure noise.
 """
 from dataclasses import dataclass
 from functools import partial
@@ -99,7 +101,7 @@ def _corners(campaign, k):
                                                    bounded=False))
 
 
-def candidates(campaign, max_motion, known, executor, *, threshold=None,
+def candidates(campaign, largest, known, executor, *, threshold=None,
                false_alarm=None):
     """
     Return the table of places where all images together show a star.
@@ -107,8 +109,9 @@ def candidates(campaign, max_motion, known, executor, *, threshold=None,
     Parameters
     ----------
     campaign : `~photutils_mgauss.pixel_motions.campaign.Campaign`
-    max_motion : float or None
-        The largest motion [mas / yr]; None for 0.1 pixels an epoch.
+    largest : (float or None, float)
+        The largest motion [mas / yr], None for 0.1 pixels an epoch, and the
+        largest parallax [mas].
     known : list of (3, n) `~numpy.ndarray`
         x, y and flux of stars of each image that are subtracted first.
     executor : `~concurrent.futures.Executor` or None
@@ -117,28 +120,44 @@ def candidates(campaign, max_motion, known, executor, *, threshold=None,
         independent place that one is made from.
     """
     grid = Grid.of(campaign)
-    motions = motion_grid(campaign, grid, max_motion)
-    best, which = _search(campaign, grid, motions, known, executor)
+    trials = trial_grid(campaign, grid, *largest)
+    best, which = _search(campaign, grid, trials, known, executor)
     width = max(fwhm(epoch) for epoch in campaign.epochs)
     if threshold is None:
-        threshold = -ndtri(false_alarm / (len(motions) * width**2))
+        threshold = -ndtri(false_alarm / (len(trials) * width**2))
     rows, columns = _peaks(best, threshold, width)
     places = grid.places(columns, rows)
     ra, dec = directions(campaign.plane.deproject(places))
+    moving = trials[which[rows, columns]]
     local = np.einsum('ijn,nj->in', campaign.plane.local_inverse(places),
-                      motions[which[rows, columns]])
+                      moving[:, :2])
     return QTable({'ra': ra * u.deg, 'dec': dec * u.deg,
                    'pmra': local[0] * u.mas / u.yr,
                    'pmdec': local[1] * u.mas / u.yr,
+                   'parallax': moving[:, 2] * u.mas,
                    'evidence': best[rows, columns].astype(float)})
 
 
-def motion_grid(campaign, grid, max_motion):
+def trial_grid(campaign, grid, max_motion, max_parallax):
+    """Return motions [mas / yr] and parallaxes [mas] that are tried (m, 3)."""
+    motions = _motions(campaign, grid, max_motion)
+    n = int(np.ceil(max_parallax / _pixel(grid) / (2 * _STEP)))
+    parallaxes = np.linspace(0, max_parallax, n + 1)
+    return np.column_stack([np.repeat(motions, n + 1, axis=0),
+                            np.tile(parallaxes, len(motions))])
+
+
+def _pixel(grid):
+    """Return the size of a pixel [mas]."""
+    return np.sqrt(abs(np.linalg.det(grid.matrix)))
+
+
+def _motions(campaign, grid, max_motion):
     """Return the motions (m, 2) that are tried [mas / yr]."""
     baseline = np.ptp(campaign.years)
     if baseline == 0:
         return np.zeros((1, 2))
-    pixel = np.sqrt(abs(np.linalg.det(grid.matrix)))
+    pixel = _pixel(grid)
     if max_motion is None:
         epochs = len(np.unique(np.round(campaign.years, 2)))
         max_motion = 0.1 * pixel * max(epochs - 1, 1) / baseline
@@ -148,8 +167,8 @@ def motion_grid(campaign, grid, max_motion):
     return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 
 
-def _search(campaign, grid, motions, known, executor):
-    """Return the largest T of all motions on the grid, and which it is."""
+def _search(campaign, grid, trials, known, executor):
+    """Return the largest T of all trials on the grid, and which it is."""
     *maps, edges = zip(*(_on_grid(campaign, grid, k, light) for k, light in
                          enumerate(known)), strict=True)
     maps = list(zip(*maps, strict=True))
@@ -160,14 +179,12 @@ def _search(campaign, grid, motions, known, executor):
     noise = np.sqrt(np.maximum(weight, 1e-30))
     best = np.full(grid.shape, -np.inf, np.float32)
     which = np.zeros(grid.shape, np.int32)
-    turn = np.linalg.inv(grid.matrix)
-    shifts = [(turn @ motions.T).T * (year - campaign.working_year)
-              for year in campaign.years]
+    shifts = _shifts(campaign, grid, trials)
     # Beside an edge a star of some motions is seen and of others is not.
     margin = 2 + max(np.abs(shift).max() for shift in shifts)
     whole = np.logical_and.reduce([edge > margin for edge in edges])
     summed = map_parallel(partial(_along, evidence, shifts),
-                          range(len(motions)), executor=executor)
+                          range(len(trials)), executor=executor)
     for v, total in enumerate(summed):
         score = np.where((weight > 0) & whole, total / noise, 0)
         larger = score > best
@@ -180,8 +197,17 @@ def _search(campaign, grid, motions, known, executor):
     return best, which
 
 
+def _shifts(campaign, grid, trials):
+    """Return how far trials move stars in each image, (m, 2) [pix]."""
+    turn = np.linalg.inv(grid.matrix)
+    middle = np.array(grid.shape[::-1], float)[:, None] / 2
+    used = trials[:, :2 + campaign.parallax]
+    return [(turn @ factor[:, 2:2 + used.shape[1], 0] @ used.T).T
+            for factor in campaign.factors(grid.places(*middle))]
+
+
 def _along(evidence, shifts, v):
-    """Return the sum of maps along motion v."""
+    """Return the sum of maps along trial v."""
     return sum(_shifted(one, *shift[v]) for one, shift in zip(
         evidence, shifts, strict=True))
 

@@ -23,6 +23,7 @@ from photutils_mgauss.pixel_motions.errors import (
     with_psf_errors,
 )
 from photutils_mgauss.pixel_motions.find import BRIGHT, Grid, candidates
+from photutils_mgauss.pixel_motions.refine import refined
 from photutils_mgauss.pixel_motions.solution import PixelMotionSolution
 from photutils_mgauss.pixel_motions.solve import fwhm, solve
 from photutils_mgauss.pixel_motions.stars import read_stars
@@ -78,6 +79,11 @@ class PixelMotionFitter:
         How far from its given place and motion a faint star may be in each
         image, in units of the FWHM of the PSF, unless the data are sure that
         it is farther away. Bright stars are free.
+    refine_frames : bool, optional
+        Whether the frames of the images are found from the pixels of the
+        bright stars, together with these: the WCS gets an affine map each,
+        which ``wcs`` of the solution contains. Positions and motions of all
+        stars together stay as the WCS and ``references`` have them.
 
     Examples
     --------
@@ -99,7 +105,8 @@ class PixelMotionFitter:
 
     def __init__(self, *, parallax=False, acceleration=False, references=None,
                  fit_shape=11, fit_sky=True, forced=False, executor=None,
-                 progress_bar=False, flux='image', reach=0.75):
+                 progress_bar=False, flux='image', reach=0.75,
+                 refine_frames=False):
         self.parallax = parallax
         self.acceleration = acceleration
         self.references = references
@@ -110,6 +117,7 @@ class PixelMotionFitter:
         self.progress_bar = progress_bar
         self.flux = flux
         self.reach = reach
+        self.refine_frames = refine_frames
         self._check()
 
     def __repr__(self):
@@ -150,13 +158,17 @@ class PixelMotionFitter:
             stars = self.find(images)
         campaign = self._read(images, stars)
         listed = read_stars(stars, campaign)
-        solution = self._solve(campaign, listed)
+        frames = None
+        if self.refine_frames:
+            campaign, frames = refined(campaign, partial(
+                self._stars, listed, reach=None))
+        solution = self._solve(campaign, listed, frames)
         for sentence in solution.notes:
             warnings.warn(sentence, AstropyUserWarning, stacklevel=2)
         return solution
 
     def find(self, images, stars=None, *, max_motion=None,
-             false_alarm=1e-5):
+             max_parallax=None, false_alarm=1e-5):
         """
         Look for stars in the evidence of all images together.
 
@@ -170,6 +182,9 @@ class PixelMotionFitter:
         max_motion : `~astropy.units.Quantity`, optional
             The largest motion along each axis that is searched; by default
             that of 0.1 pixels an epoch. Time grows with its square.
+        max_parallax : `~astropy.units.Quantity`, optional
+            The largest parallax that is searched, with ``parallax=True``;
+            by default none is. Parallaxes below half a pixel need no search.
         false_alarm : float, optional
             How often noise may be taken for a star, at each independent
             place.
@@ -188,10 +203,15 @@ class PixelMotionFitter:
         """
         self._check()
         as_real(false_alarm, 'false_alarm', above=0, maximum=0.5)
-        if max_motion is not None:
-            max_motion = _as_motion(max_motion)
+        largest = [None if value is None else _as_plain(value, name, unit)
+                   for value, name, unit in (
+                       (max_motion, 'max_motion', u.mas / u.yr),
+                       (max_parallax, 'max_parallax', u.mas))]
+        if max_parallax is not None and not self.parallax:
+            msg = 'max_parallax must be given with parallax=True only'
+            raise ValueError(msg)
         campaign = self._read(images, stars)
-        look = partial(candidates, campaign, max_motion,
+        look = partial(candidates, campaign, (largest[0], largest[1] or 0.0),
                        executor=self.executor)
         known = ([] if stars is None else
                  [self._solve(campaign, read_stars(stars, campaign))])
@@ -218,31 +238,43 @@ class PixelMotionFitter:
                              parallax=self.parallax or given,
                              acceleration=self.acceleration)
 
-    def _solve(self, campaign, listed):
+    def _stars(self, listed, campaign, reach):
+        """Return the `Solved` of the stars listed."""
+        return solve(campaign, listed.values,
+                     as_shape(self.fit_shape, 'fit_shape'), reach=reach,
+                     forced=self.forced, executor=self.executor,
+                     progress_bar=self.progress_bar)
+
+    def _solve(self, campaign, listed, frames=None):
         """Return the solution of the stars listed."""
         start = campaign.views(listed.values[:, None]).pixels
-        shape = as_shape(self.fit_shape, 'fit_shape')
-        solved = solve(campaign, listed.values, shape,
-                       reach=self.reach, forced=self.forced,
-                       executor=self.executor,
-                       progress_bar=self.progress_bar)
-        errors = errors_of(campaign, solved)
-        if campaign.estimated:
-            errors = _scaled(campaign, solved, errors)
-        errors = with_psf_errors(campaign, solved, errors, shape,
-                                 self.executor)
-        if self.references is not None:
-            errors = replace(errors, covariance=errors.covariance
-                             + frame_covariance(self.references, campaign,
-                                                solved, errors.plain))
+        solved = self._stars(listed, campaign, self.reach)
+        errors = self._errors(campaign, solved, frames)
         table = star_table(campaign, listed, solved, errors, start[:, :, 0],
                            forced=self.forced, relative=self._is_relative())
         images = image_table(campaign, solved, errors)
         notes = campaign.notes + _coverage(campaign, solved)
+        if frames is not None:
+            notes += frames.notes
         if not self.forced:
             notes += shift_notes(images)
         return PixelMotionSolution(table, images, notes, campaign, listed,
                                    solved, errors)
+
+    def _errors(self, campaign, solved, frames):
+        """Return the `Errors` of pixels, PSFs and frames."""
+        errors = errors_of(campaign, solved)
+        if campaign.estimated:
+            errors = _scaled(campaign, solved, errors)
+        errors = with_psf_errors(campaign, solved, errors, as_shape(
+            self.fit_shape, 'fit_shape'), self.executor)
+        covariance = errors.covariance
+        if frames is not None:
+            covariance = covariance + frames.covariance(campaign, solved)
+        if self.references is not None:
+            covariance = covariance + frame_covariance(
+                self.references, campaign, solved, errors.plain, frames)
+        return replace(errors, covariance=covariance)
 
     def _is_relative(self):
         return (self.references is not None
@@ -253,11 +285,14 @@ class PixelMotionFitter:
         as_real(self.reach, 'reach', above=0)
         as_shape(self.fit_shape, 'fit_shape')
         for name in ('parallax', 'acceleration', 'fit_sky', 'forced',
-                     'progress_bar'):
+                     'progress_bar', 'refine_frames'):
             if not isinstance(getattr(self, name), bool):
                 msg = (f'{name} must be True or False, got '
                        f'{getattr(self, name)!r:.80}')
                 raise TypeError(msg)
+        if self.refine_frames and self.forced:
+            msg = 'refine_frames must be False with forced=True, got True'
+            raise ValueError(msg)
         if not isinstance(self.references, MotionSolution | None):
             msg = ('references must be the MotionSolution that the WCS of the '
                    f'images come from, got {type(self.references).__name__}')
@@ -294,15 +329,15 @@ def _apart(campaign, faint, bright):
     return faint[away > 0.7 * radius]
 
 
-def _as_motion(value):
-    """Return a motion in mas / yr, or raise."""
+def _as_plain(value, name, unit):
+    """Return a Quantity as a number of a unit, or raise."""
     try:
-        value = u.Quantity(value, u.mas / u.yr)
+        value = u.Quantity(value, unit)
     except (TypeError, u.UnitConversionError) as error:
-        msg = (f'max_motion must be a Quantity like mas / yr, got '
+        msg = (f'{name} must be a Quantity like {unit}, got '
                f'{value!r:.80}')
         raise TypeError(msg) from error
-    return as_real(float(value.value), 'max_motion', minimum=0)
+    return as_real(float(value.value), name, minimum=0)
 
 
 def _scaled(campaign, solved, errors):

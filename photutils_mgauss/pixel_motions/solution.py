@@ -108,6 +108,11 @@ class PixelMotionSolution:
                           self._errors)
 
     @property
+    def wcs(self):
+        """The WCS of all images, corrected if frames were refined."""
+        return self._campaign.frames
+
+    @property
     def sky(self):
         """The stars as a `~astropy.coordinates.SkyCoord` with motions."""
         return SkyCoord(self.stars['ra'], self.stars['dec'],

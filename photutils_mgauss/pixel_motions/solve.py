@@ -105,9 +105,9 @@ def solve(campaign, values, fit_shape, *, reach, forced, executor,
     """
     Fit stars (n, p) to all images; return their `Solved`.
 
-    Faint ones stay within ``reach``, in units of the PSF's FWHM. Stars whose
-    place is not finite, or that no image shows, are left out of the fit and
-    get no pixels.
+    Faint ones stay within ``reach``, in units of the PSF's FWHM; None leaves
+    all at the peaks of their likelihood. Stars whose place is not finite, or
+    that no image shows, are left out of the fit and get no pixels.
     """
     pixels = campaign.views(values[:, None]).pixels[:, :, 0]
     groups = _groups(campaign, pixels)
@@ -115,7 +115,8 @@ def solve(campaign, values, fit_shape, *, reach, forced, executor,
     fit_all = partial(_fit_all, groups=groups, fit_shape=fit_shape,
                       forced=forced, spread_over=partial(
                           _spread_over, executor, progress_bar))
-    region = None if forced else _Region.of(campaign, values, reach)
+    region = (None if forced or reach is None else
+              _Region.of(campaign, values, reach))
     if not near:
         return fit_all(campaign, values, own=None, region=region)
     own, moved = None, np.inf

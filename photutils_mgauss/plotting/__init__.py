@@ -21,6 +21,7 @@ from photutils_mgauss.plotting.fit import (
 from photutils_mgauss.plotting.grid import (
     plot_node_map,
     plot_psf_image,
+    plot_radial_profile,
     plot_shape_map,
     plot_whiskers,
     plot_width_map,
@@ -44,6 +45,7 @@ from photutils_mgauss.plotting.stars import (
     plot_comparison,
     plot_detections,
     plot_error_curve,
+    plot_residual_image,
     plot_stated_errors,
 )
 
@@ -67,7 +69,9 @@ __all__ = [
     'plot_projection',
     'plot_proper_motions',
     'plot_psf_image',
+    'plot_radial_profile',
     'plot_residual',
+    'plot_residual_image',
     'plot_residual_vectors',
     'plot_shape_map',
     'plot_stated_errors',

@@ -9,6 +9,7 @@ from photutils_mgauss.psf.shapes import adaptive_moments
 __all__ = [
     'plot_node_map',
     'plot_psf_image',
+    'plot_radial_profile',
     'plot_shape_map',
     'plot_whiskers',
     'plot_width_map',
@@ -110,7 +111,22 @@ def plot_whiskers(psf, *, layout=None, scale=None, ax=None):
                                                   1e-12)
     ends = np.stack([middle - scale * half, middle + scale * half])
     ax.plot(*np.moveaxis(ends, -1, 0), color=BLUE, linewidth=1)
+    _draw_key(ax, scale, np.hypot(*half.T).max() * 2)
     return _focal_plane(ax, psfs, places)
+
+
+def _draw_key(ax, scale, largest):
+    """Draw a whisker of a round ellipticity above the Axes."""
+    decade = 10.0 ** np.floor(np.log10(max(largest, 1e-12)))
+    key = max(step * decade for step in (1, 2, 5)
+              if step == 1 or step * decade <= largest)
+    # Across, in data; upwards, in fractions of the Axes.
+    across = ax.get_xaxis_transform()
+    left = ax.dataLim.x0
+    ax.plot([left, left + scale * key], [1.03, 1.03], color=BLUE,
+            transform=across, clip_on=False)
+    ax.annotate(f'  ellipticity {key:g}', (left + scale * key, 1.03),
+                xycoords=across, va='center', annotation_clip=False)
 
 
 def plot_worst_node(psf, source, column='size_error', *, ax=None):
@@ -210,6 +226,44 @@ def plot_psf_image(psf, x, y, *, radius=8, decades=4, ax=None):
     ax = plot_mixture(psf.mixture_at(x, y), radius=radius, decades=decades,
                       pixel_integrated=psf.pixel_integrated, ax=ax)
     ax.set_title(f'the PSF at ({x:.0f}, {y:.0f})')
+    return ax
+
+
+def plot_radial_profile(psf, x, y, *, radius=8, ax=None):
+    """
+    Plot the PSF at a place against the distance from its centre.
+
+    The line is the mean over all directions, the band goes from the least to
+    the most.
+
+    Parameters
+    ----------
+    psf : GriddedMixturePSF
+        The PSF.
+    x, y : float
+        The place on the detector [pix].
+    radius : float, optional
+        Out to where [pix].
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+    """
+    ax = current_axes(ax)
+    distance = np.linspace(0, radius, 200)
+    angle = np.linspace(0, 2 * np.pi, 72, endpoint=False)[:, None]
+    values = psf.mixture_at(x, y).evaluate(
+        distance * np.cos(angle), distance * np.sin(angle),
+        pixel_integrated=psf.pixel_integrated)
+    ax.fill_between(distance, np.maximum(values.min(axis=0), 1e-300),
+                    values.max(axis=0), color=BLUE, alpha=0.25, linewidth=0)
+    ax.plot(distance, values.mean(axis=0), color=BLUE)
+    peak = values.max()
+    ax.set(yscale='log', ylim=(peak * 1e-5, peak * 1.5), xlim=(0, radius),
+           xlabel='distance from the centre [pix]',
+           ylabel='flux in a pixel / flux of the star')
     return ax
 
 

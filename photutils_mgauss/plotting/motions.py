@@ -24,8 +24,8 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     epoch : int
         Number of the epoch, from 0.
     scale : float, optional
-        Residual [mas] as long as a tenth of the field; the default is three
-        times the median residual.
+        Residual [mas] as long as a tenth of the field, which the key shows;
+        the default is three times the median residual.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw; None is pyplot's current Axes.
 
@@ -41,15 +41,20 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     good = np.isfinite(x + y + u + v)
     if scale is None:
         scale = 3 * np.median(np.hypot(u[good], v[good]))
-    width = np.ptp(x[good]) / 10
+    unit = scale / (np.ptp(x[good]) / 10)
     used = np.asarray(rows['used'])
     for which, colour in ((good & used, BLUE), (good & ~used, ORANGE)):
-        ax.quiver(x[which], y[which], u[which], v[which], color=colour,
-                  angles='xy', scale_units='xy', scale=scale / width)
-    ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal',
-           title=f'epoch {epoch}: a tenth of the field is {scale:.2g} '
-                 f'{rows["dra"].unit}')
+        arrows = ax.quiver(x[which], y[which], u[which], v[which],
+                           color=colour, angles='xy', scale_units='xy',
+                           scale=unit)
+    # The frame holds the tips, too.
+    ax.update_datalim(np.column_stack([x + u / unit, y + v / unit])[good])
+    ax.autoscale_view()
+    ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal')
+    ax.set_title(f'epoch {epoch}', loc='left')
     ax.invert_xaxis()
+    ax.quiverkey(arrows, 0.85, 1.04, scale, f'{scale:.2g} {rows["dra"].unit}',
+                 labelpos='W', color=BLUE)
     return ax
 
 
@@ -210,21 +215,21 @@ def plot_errors_by_epochs(solutions, *, ax=None):
     return ax
 
 
-def plot_cutouts(ax, cutouts):
+def plot_cutouts(cutouts, *, ax=None):
     """
     Draw what each image shows of one star: data, model and residual.
 
     Parameters
     ----------
-    ax : `~matplotlib.axes.Axes`
-        Where to draw.
     cutouts : `~astropy.table.QTable`
         As `~photutils_mgauss.PixelMotionSolution.cutouts` returns it.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
 
     Returns
     -------
     `~matplotlib.axes.Axes`
-        The same: a column for each image, grey from -2 to 5 times the
+        Its Axes: a column for each image, grey from -2 to 5 times the
         scatter of the residuals in it. Crosses are where the fit has the
         star.
 
@@ -236,6 +241,7 @@ def plot_cutouts(ax, cutouts):
     if not len(cutouts):
         msg = 'cutouts must have at least one row, got none'
         raise ValueError(msg)
+    ax = current_axes(ax)
     parts = ('data', 'model', 'residual')
     stamps = np.stack([_plain(cutouts[name]) for name in parts])
     _, n, ny, nx = stamps.shape

@@ -7,6 +7,7 @@ from photutils_mgauss.plotting.style import (
     BLUE,
     CYCLE,
     ORANGE,
+    VERMILION,
     current_axes,
 )
 
@@ -14,11 +15,12 @@ __all__ = [
     'plot_comparison',
     'plot_detections',
     'plot_error_curve',
+    'plot_residual_image',
     'plot_stated_errors',
 ]
 
 
-def plot_detections(x, y, flux, *, ax=None):
+def plot_detections(x, y, flux, *, data=None, ax=None):
     """
     Map the stars of a catalogue, brighter ones larger.
 
@@ -26,6 +28,8 @@ def plot_detections(x, y, flux, *, ax=None):
     ----------
     x, y, flux : (n,) array_like
         Positions [pix] and fluxes.
+    data : (ny, nx) array_like, optional
+        The image, to be shown below circles about the stars.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw; None is pyplot's current Axes.
 
@@ -36,9 +40,50 @@ def plot_detections(x, y, flux, *, ax=None):
     ax = current_axes(ax)
     flux = np.maximum(np.nan_to_num(flux), 1e-300)
     size = np.clip(np.log10(flux / np.percentile(flux, 5)), 0.1, 3)
-    ax.scatter(x, y, s=4 * size**2, color=BLACK, linewidths=0, alpha=0.7)
+    if data is None:
+        ax.scatter(x, y, s=4 * size**2, color=BLACK, linewidths=0, alpha=0.7)
+    else:
+        _show_image(ax, np.asarray(data, float))
+        ax.scatter(x, y, s=20 + 10 * size**2, facecolors='none',
+                   edgecolors=VERMILION, linewidths=0.6)
     ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal',
            title=f'{len(flux)} stars')
+    return ax
+
+
+def _show_image(ax, data):
+    """Show an image so that faint and bright stars are seen."""
+    middle, spread = np.nanmedian(data), mad_std(data, ignore_nan=True)
+    shown = np.arcsinh((data - middle) / max(3 * spread, 1e-300))
+    ax.imshow(shown, origin='lower', cmap='gray_r', interpolation='nearest')
+
+
+def plot_residual_image(residual, error, *, limit=5, ax=None):
+    """
+    Show what a model of the stars leaves of an image, in standard errors.
+
+    Parameters
+    ----------
+    residual : (ny, nx) array_like
+        Image minus model and sky; NaN is left out.
+    error : (ny, nx) array_like
+        The standard deviation of the pixels, in the unit of ``residual``.
+    limit : float, optional
+        The number of standard errors at the ends of the colours.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        Its Axes, with a colour bar beside them.
+    """
+    ax = current_axes(ax)
+    shown = ax.imshow(np.asarray(residual) / np.asarray(error),
+                      origin='lower', cmap='RdBu_r', vmin=-limit, vmax=limit,
+                      interpolation='nearest')
+    ax.figure.colorbar(shown, ax=ax, label='residual / error')
+    ax.set(xlabel='x [pix]', ylabel='y [pix]')
     return ax
 
 

@@ -77,6 +77,7 @@ class PSFModel(Fittable2DModel):
 
     interpolation = 'blend'
     outside = 'clamp'
+    contexts = ()
 
     if compat.STALE_GROUP_MODELS:
         __class__ = property(compat.group_class)

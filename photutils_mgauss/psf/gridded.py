@@ -24,6 +24,13 @@ from photutils_mgauss.psf.base import (
     split_flux,
     with_unit,
 )
+from photutils_mgauss.psf.contexts import (
+    PSFContext,
+    at_values,
+    from_columns,
+    known_contexts,
+    to_columns,
+)
 from photutils_mgauss.psf.convert import GridConversions
 from photutils_mgauss.psf.errors import PSFErrors
 from photutils_mgauss.psf.grid import checked_arrays, make_grid, plain_report
@@ -95,6 +102,11 @@ class GriddedMixturePSF(GridConversions, PSFModel):
     errors : PSFErrors, optional
         How far the PSF may be off, as ``MixtureField.psf_errors`` knows it.
         Photometry adds it to the errors of stars.
+    contexts : sequence of PSFContext, optional
+        How the PSF changes with the colour or the flux of a star, as
+        ``MixtureField.to_grid`` knows it. The grid itself is the PSF of usual
+        stars, and so are its values; `MixturePSFPhotometry` fits each star
+        with the PSF of its own.
     **kwargs
         Keywords of `~astropy.modeling.Model`: ``name``, ``meta``, ``fixed``,
         ``bounds``.
@@ -127,10 +139,11 @@ n_components=1)>
 
     def __init__(self, mixtures, grid_xypos, *, flux=1, x_0=0, y_0=0,
                  pixel_integrated=False, scales=None, interpolation='blend',
-                 outside='clamp', errors=None, **kwargs):
+                 outside='clamp', errors=None, contexts=(), **kwargs):
         mixtures = list(mixtures)
         grid, order = make_grid(mixtures, grid_xypos, scales)
-        self._set_up(grid, pixel_integrated, interpolation, outside, errors)
+        self._set_up(grid, pixel_integrated, interpolation, outside, errors,
+                     contexts)
         self._report = plain_report(
             grid.positions, (grid.weights != 0).sum(axis=1), grid.scales)
         self._report['bridged'] = [mixtures[i] is None for i in order]
@@ -138,8 +151,12 @@ n_components=1)>
         self._finish()
 
     def _set_up(self, grid, pixel_integrated, interpolation, outside,
-                errors):
+                errors, contexts):
         self._grid = grid
+        self._contexts = tuple(contexts)
+        if not all(isinstance(one, PSFContext) for one in self._contexts):
+            msg = f'contexts must be PSFContext objects, got {contexts!r:.80}'
+            raise TypeError(msg)
         if not (errors is None or isinstance(errors, PSFErrors)):
             msg = f'errors must be PSFErrors or None, got {errors!r:.80}'
             raise TypeError(msg)
@@ -156,10 +173,11 @@ n_components=1)>
     @classmethod
     def _of_grid(cls, grid, report=None, *, pixel_integrated=False,
                    interpolation='blend', outside='clamp', errors=None,
-                   **kwargs):
+                   contexts=(), **kwargs):
         """Return a model of a grid that needs no checks."""
         new = cls.__new__(cls)
-        new._set_up(grid, pixel_integrated, interpolation, outside, errors)
+        new._set_up(grid, pixel_integrated, interpolation, outside, errors,
+                    contexts)
         new._report = report if report is not None else plain_report(
             grid.positions, (grid.weights != 0).sum(axis=1), grid.scales)
         PSFModel.__init__(new, **kwargs)
@@ -218,6 +236,11 @@ n_components=1)>
     def errors(self):
         """How far the PSF may be off, or None if that is not known."""
         return self._errors
+
+    @property
+    def contexts(self):
+        """How the PSF changes with colours and fluxes, a tuple."""
+        return self._contexts
 
     @property
     def interpolation(self):
@@ -408,6 +431,36 @@ n_components=1)>
         index, share = self._inside(x, y).neighbours(x, y)
         return float(share @ self._grid.scales[index])
 
+    def at_context(self, **values):
+        """
+        Return the grid of stars of a colour, or of another context.
+
+        Parameters
+        ----------
+        **values : float
+            For names of ``contexts``; others stay what they are.
+
+        Returns
+        -------
+        GriddedMixturePSF
+            Its mixtures are blends of those that are known.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a name is not that of a context, or a value not a number.
+        """
+        values = known_contexts(values, [one.name for one in self._contexts])
+        return GriddedMixturePSF(
+            at_values(self.mixtures, self._contexts, values),
+            self.grid_xypos, flux=self.flux.value, x_0=self.x_0.value,
+            y_0=self.y_0.value, scales=self.scales,
+            pixel_integrated=self._pixel_integrated,
+            interpolation=self._interpolation, outside=self._outside,
+            errors=self._errors, contexts=[
+                context for context in self._contexts
+                if context.name not in values])
+
     def local_model(self, x, y):
         """
         Return the PSF at a detector position as a model of its own.
@@ -446,7 +499,8 @@ n_components=1)>
             x_0=self.x_0.value, y_0=self.y_0.value, scales=self.scales,
             pixel_integrated=self._pixel_integrated,
             interpolation=self._interpolation, outside=self._outside,
-            errors=errors)
+            errors=errors, contexts=[one.convolved(kernel)
+                                     for one in self._contexts])
         new._report['bridged'] = self._report['bridged']
         return new
 
@@ -501,25 +555,34 @@ n_components=1)>
                   'nodes': nodes, 'report': table_columns(self._report)}
         if self._errors is not None:
             tables['psf_errors'] = self._errors.to_columns()
+        if self._contexts:
+            tables['contexts'] = to_columns(self._contexts)
         return tables
 
     @classmethod
     def _from_tables(cls, tables):
         model, nodes = tables['model'], tables['nodes']
         n = len(nodes['x'])
-        grid = checked_arrays(
-            nodes['x'], nodes['y'], nodes['weight'].reshape(n, -1),
-            nodes['mean'].reshape(n, -1, 2),
-            nodes['covariance'].reshape(n, -1, 2, 2), nodes['scale'])
+
+        def grid(scales, weights, means, covariances):
+            return checked_arrays(
+                nodes['x'], nodes['y'], weights.reshape(n, -1),
+                means.reshape(n, -1, 2), covariances.reshape(n, -1, 2, 2),
+                # FITS has no axes of one element.
+                np.reshape(scales, n))
         report = tables.get('report')
         errors = tables.get('psf_errors')
+        options = {'pixel_integrated': bool(model['pixel_integrated'][0]),
+                   'interpolation': str(model['interpolation'][0]),
+                   'outside': str(model['outside'][0])}
+        contexts = from_columns(tables.get('contexts'), lambda *arrays:
+                                cls._of_grid(grid(*arrays), **options))
         return cls._of_grid(
-            grid, QTable(report) if report else None,
-            pixel_integrated=model['pixel_integrated'][0],
-            interpolation=str(model['interpolation'][0]),
-            outside=str(model['outside'][0]),
+            grid(*(nodes[name] for name in ('scale', 'weight', 'mean',
+                                            'covariance'))),
+            QTable(report) if report else None,
             errors=PSFErrors.from_columns(errors) if errors else None,
-            name=str(model['name'][0]) or None,
+            contexts=contexts, **options, name=str(model['name'][0]) or None,
             **cls._parameter_keywords(tables['parameters']))
 
     def _half_size(self):

@@ -6,7 +6,9 @@ isolated stars of one signal-to-noise ratio an epoch in seven images at the
 times of Nie et al., frames known, from catalogues (single-epoch photometry of
 what is found at 5 sigma, at least three epochs) and from the pixels, against
 the Cramer-Rao bound by numeric derivatives; ``parallax`` stars of 1 mas in 20
-epochs; ``speed`` many stars, CPU seconds.
+epochs; ``speed`` many stars, CPU seconds; ``scene`` 614 stars and 590 quasars
+in a field of a few arcminutes, PSFs and frames from the images, what stars
+are found included, errors of motions against magnitude.
 
 A star counts as measured if it has a motion, no flag, and a significance of
 at least 5 in all images together. RMS and pulls are over all of these, none
@@ -22,17 +24,23 @@ from astropy.coordinates import SkyCoord
 from astropy.stats import mad_std
 from astropy.table import QTable
 from astropy.wcs import WCS
+from photutils.detection import DAOStarFinder
 
 from photutils_mgauss import (
     Epoch,
     GaussianMixture,
     GriddedMixturePSF,
     ImageEpoch,
+    Instrument,
     MixturePSFPhotometry,
     PixelMotionFitter,
     ProperMotionFitter,
+    fit_mixture_field,
     paper_exposures,
     render_stars,
+    select_psf_stars,
+    simulate_epochs,
+    sky_field,
 )
 from photutils_mgauss.sky.observers import observer_position
 
@@ -223,12 +231,97 @@ def print_speed(options):
           f'{time.perf_counter() - wall:.1f} s')
 
 
+def measured_epoch(scene):
+    """Return the PSF of an image from its stars, and its catalogue."""
+    data = scene.image - np.median(scene.image)
+    stars = select_psf_stars(data, error=scene.error, mask=scene.mask)
+    field = fit_mixture_field(data, stars, error=scene.error, mask=scene.mask,
+                              n_components=3, degree=1)
+    finder = DAOStarFinder(5 * mad_std(data), 2.0)
+    catalogue = MixturePSFPhotometry(
+        field, (BOX, BOX), finder=finder, aperture_radius=3, xy_cov=True)(
+        data, error=scene.error, mask=scene.mask)
+    catalogue.remove_column('id')
+    good = (catalogue['flags'] == 0) & (
+        catalogue['flux_fit'] > 5 * catalogue['flux_err'])
+    return field, Epoch(catalogue[good], scene.wcs, scene.time)
+
+
+def paper_scene(options):
+    """Return sources, and motions of them from catalogues and pixels."""
+    sources = sky_field(614, 590, size=options.field, parallaxes=False,
+                        separation=1.0, rng=options.seed)
+    side = round(options.field * 6e4 / SCALE)
+    scenes = simulate_epochs(sources, paper_exposures(offset=1.0),
+                             instrument=Instrument(shape=(side, side)),
+                             rng=options.seed + 1)
+    fields, epochs = zip(*map(measured_epoch, scenes), strict=True)
+    quasars = sources[sources['kind'] == 'qso']['ra', 'dec']
+    quasars['class'] = 'qso'
+    frames = ProperMotionFitter(references=quasars).fit(epochs)
+    images = [ImageEpoch(scene.image, field, epoch.wcs, scene.time,
+                         error=scene.error, mask=scene.mask,
+                         band=scene.exposure.band.name)
+              for scene, field, epoch in zip(scenes, fields, frames.epochs,
+                                             strict=True)]
+    return sources, frames.stars, PixelMotionFitter(references=frames).fit(
+        images).stars
+
+
+def print_scene(options):
+    """Print errors of stars against magnitude, a line for half of one."""
+    sources, *both = paper_scene(options)
+    stars = np.flatnonzero(sources['kind'] == 'star')
+    columns = [np.asarray(sources['mag_g'])[stars]]
+    for table in both:
+        good = np.isfinite(table['pmra_error'].value)
+        some = table[good & (np.asarray(table['reference']) == '')]
+        index, away, _ = SkyCoord(sources['ra'], sources['dec'])[
+            stars].match_to_catalog_sky(SkyCoord(some['ra'], some['dec']))
+        same = away < 0.15 * u.arcsec
+        for axis in ('pmra', 'pmdec'):
+            off = (some[axis][index] - sources[axis][stars]).value
+            error = some[f'{axis}_error'][index].value
+            columns += [np.where(same, off, np.nan),
+                        np.where(same, error, np.nan)]
+    columns = np.array(columns)
+    print('g      stars   catalogues: measured, median error, scatter   '
+          'pixels: the same [mas / yr]')
+    for low in np.arange(20, 26, 0.5):
+        some = columns[:, (columns[0] >= low) & (columns[0] < low + 0.5)]
+        words = f'{low + 0.25:5.2f}  {some.shape[1]:4d}'
+        for first in (1, 5):
+            off, error = some[first:first + 4:2], some[first + 1:first + 4:2]
+            there = np.isfinite(off)
+            scatter = 1.4826 * np.nanmedian(np.abs(off))
+            words += (f'     {there.mean():6.1%} {np.nanmedian(error):7.3f} '
+                      f'{scatter:7.3f}')
+        print(words, flush=True)
+    for name, first in (('catalogues', 1), ('pixels', 5)):
+        error = np.hypot(columns[first + 1], columns[first + 3]) / np.sqrt(2)
+        fine = error < 2
+        print(f'{name}: {fine.sum()} stars with errors below 2 mas / yr, the '
+              f'faintest of g = {columns[0][fine].max():.2f}; half of those '
+              f'to g = {last_half(columns[0], fine):.2f}', flush=True)
+
+
+def last_half(magnitude, fine):
+    """Return the magnitude at which half of the stars are fine."""
+    order = np.argsort(magnitude)
+    share = np.convolve(fine[order], np.ones(31) / 31, mode='same')
+    bright = magnitude[order] < np.median(magnitude)
+    below = np.flatnonzero((share < 0.5) & ~bright)
+    return magnitude[order][below[0]]
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
     parser.add_argument('parts', nargs='*',
                         default=['table', 'parallax', 'speed'])
     parser.add_argument('--side', type=int, default=30)
     parser.add_argument('--speed-side', type=int, default=100)
+    parser.add_argument('--field', type=float, default=2.4,
+                        help='side of the scene [arcmin]')
     parser.add_argument('--seed', type=int, default=7)
     parser.add_argument('--signals', type=float, nargs='+',
                         default=[2.5, 3, 4, 5, 7, 10])
@@ -236,7 +329,7 @@ def main():
     warnings.simplefilter('ignore')
     for part in options.parts:
         {'table': print_table, 'parallax': print_parallax,
-         'speed': print_speed}[part](options)
+         'speed': print_speed, 'scene': print_scene}[part](options)
 
 
 if __name__ == '__main__':

@@ -23,7 +23,7 @@ from photutils_mgauss.files.image_layers import read_wcs
 # Where this package is imported from, also from another folder.
 SOURCES = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get(
     'PYTHONPATH')])]
-COMMANDS = ('psf', 'photometry', 'motions', 'report', 'info', 'demo')
+COMMANDS = ('psf', 'photometry', 'motions', 'report', 'survey', 'info', 'demo')
 
 
 def mgauss(*arguments, folder=None):

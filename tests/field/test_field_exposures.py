@@ -8,6 +8,7 @@ from photutils_mgauss import (
     EmpiricalPSF,
     GaussianMixture,
     MixtureField,
+    MixturePSFPhotometry,
     fit_mixture_field,
 )
 
@@ -81,6 +82,35 @@ def test_a_grid_may_be_that_of_one_exposure(field):
     grid = field.to_grid((2, 2), exposure=1)
     assert_allclose(grid.mixture_at(0, 0).evaluate(1, 1),
                     field.mixture_at(0, 0, exposure=1).evaluate(1, 1))
+
+
+def test_a_field_may_be_that_of_one_exposure(field, exposures, tmp_path):
+    alone = field.at_exposure(1)
+    assert alone.mixture_at(30, 40) == field.mixture_at(30, 40, exposure=1)
+    assert len(alone.stars) == len(alone.residual_stars) == 25
+    assert_allclose(alone.to_grid((2, 2)).evaluate(0, 1, 1, 0, 0),
+                    field.to_grid((2, 2), exposure=1).evaluate(0, 1, 1, 0, 0))
+    alone.write(tmp_path / 'one.fits')
+    again = MixtureField.read(tmp_path / 'one.fits')
+    assert again.mixture_at(30, 40) == alone.mixture_at(30, 40)
+    assert alone.aperture_correction_error(3, 30, 40) > 0
+    with pytest.raises(ValueError, match='exposure must be below 3, got 3'):
+        field.at_exposure(3)
+
+
+def test_the_errors_of_an_exposure_hold_what_it_adds(field):
+    mean, alone = (
+        np.abs(errors.changes[..., 3]).max() for errors in (
+            field.psf_errors(), field.at_exposure(1).psf_errors()))
+    assert alone > mean
+
+
+def test_photometry_of_an_exposure_takes_its_field(field, exposures):
+    data, stars, error = (one[2] for one in exposures)
+    chi2 = {e: np.median(MixturePSFPhotometry(field.at_exposure(e), 11)(
+        data, error=error, init_params=stars)['reduced_chi2']) for e in (0,
+                                                                         2)}
+    assert 0.85 < chi2[2] < 1.25 < 1.5 < chi2[0]
 
 
 def test_exposures_survive_a_file(field, tmp_path):

@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from astropy.table import QTable
 from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
@@ -27,6 +28,7 @@ from photutils_mgauss import (
     ProperMotionFitter,
     decode_motion_flags,
     fit_many,
+    fit_mixture_field,
 )
 from photutils_mgauss.psf.errors import PSFErrors
 
@@ -306,6 +308,77 @@ def test_errors_of_frames_are_those_of_frames_that_move(rng):
     assert_allclose(added[4], expected, rtol=0.05, atol=2e-3)
 
 
+def literal_covariances(x, y, years, error):
+    """Return covariances (n, 4, 4) of stars whose frames are free [mas]."""
+    dt = np.asarray(years) - np.mean(years)
+    n, n_images = len(x), len(dt)
+    basis = np.stack([np.ones(n), x - np.mean(x), y - np.mean(y)]) / 15
+    rows = np.zeros((n_images, n, 2, 4 * n + 6 * n_images))
+    free = np.zeros((2, 2, 3, 6 * n_images))
+    for k in range(n_images):
+        for axis in range(2):
+            at = 4 * n + 6 * k + 3 * axis
+            for i in range(n):
+                rows[k, i, axis, 4 * i + axis] = 1
+                rows[k, i, axis, 4 * i + 2 + axis] = dt[k]
+                rows[k, i, axis, at:at + 3] = basis[:, i]
+            for power in range(2):
+                free[axis, power, :, at - 4 * n:at - 4 * n + 3] = (
+                    np.eye(3) * dt[k]**power)
+    rows = rows.reshape(-1, rows.shape[-1]) / error
+    free = free.reshape(12, -1)
+    matrix = rows.T @ rows
+    # Maps that all stars follow are zero.
+    matrix[4 * n:, 4 * n:] += 1e4 * free.T @ free
+    inverse = np.linalg.inv(matrix)
+    return np.stack([inverse[4 * i:4 * i + 4, 4 * i:4 * i + 4]
+                     for i in range(n)])
+
+
+def test_frames_and_bright_stars_are_found_together(rng):
+    x, y = (a.ravel() for a in np.meshgrid([12, 24, 36, 48.0],
+                                           [12, 24, 36, 48.0]))
+    stars = truth(x, y, rng.normal(0, 10, (2, x.size)))
+    years = (*YEARS, 2025.5)
+    images = observe(stars, 20000.0, years, rng)
+    wrong = []
+    for image in images:
+        wcs = image.wcs.deepcopy()
+        wcs.wcs.crpix += rng.normal(0, 0.05, 2)
+        wcs.wcs.cd = wcs.wcs.cd @ (np.eye(2) + rng.normal(0, 1e-3, (2, 2)))
+        wrong.append(replace(image, wcs=wcs))
+    start = stars['id', 'ra', 'dec']
+    known = PixelMotionFitter().fit(images, start).stars
+    found = PixelMotionFitter(refine_frames=True).fit(wrong, start)
+    design = np.stack([np.ones(x.size), x, y], axis=1)
+    place = offsets(found.stars, stars)[:, :4]
+    place[:, 2:] -= np.column_stack([stars['pmra'].value,
+                                     stars['pmdec'].value])
+    left = place - design @ np.linalg.lstsq(design, place, rcond=None)[0]
+    stated = errors(found.stars)[:, :4]
+    assert 0.75 < np.sqrt(np.mean((left / stated)**2)) < 1.25
+    # Alone, and with frames of their own, as literal equations have it.
+    error = errors(known)[:, 0].mean() * np.sqrt(len(years))
+    want = literal_covariances(x, y, years, error)
+    assert_allclose(stated, np.sqrt(np.einsum('nii->ni', want)), rtol=0.05)
+    for image, wcs in zip(images, found.wcs, strict=True):
+        away = wcs.pixel_to_world(x, y).separation(
+            image.wcs.pixel_to_world(x, y))
+        assert away.max() < 1.5 * u.pix * SCALE * u.mas / u.pix
+
+
+def test_images_of_too_few_bright_stars_keep_their_wcs(rng):
+    star = truth(30.0, 30.0)
+    images = observe(star, 5000.0, YEARS, rng)
+    with pytest.warns(AstropyUserWarning, match='0, 1, 2, 3 show fewer'):
+        solution = PixelMotionFitter(refine_frames=True).fit(
+            images, star['ra', 'dec'])
+    plain = PixelMotionFitter().fit(images, star['ra', 'dec'])
+    assert_allclose(solution.stars['pmra_error'], plain.stars['pmra_error'])
+    with pytest.raises(ValueError, match='refine_frames must be False'):
+        PixelMotionFitter(refine_frames=True, forced=True)
+
+
 def unsure_psf(change):
     """Return the PSF, and one that is off by its one change."""
     grid = GriddedMixturePSF([MIXTURE], [(0, 0)]).grid
@@ -423,6 +496,31 @@ def test_images_without_errors_have_errors_from_their_scatter(rng):
                     rtol=0.2)
 
 
+def test_each_image_may_have_another_kind_of_psf(rng):
+    star = truth(30.2, 29.6, (20, 10))
+    images = observe(star, 2000.0, YEARS, rng)
+    grid = GriddedMixturePSF([MIXTURE] * 4, [(0, 0), (59, 0), (0, 59),
+                                             (59, 59)])
+    noise = rng.normal(0, 0.01, (60, 60))
+    x, y = (a.ravel() for a in np.meshgrid([10, 30, 50.0], [10, 30, 50.0]))
+    light = sum(MIXTURE.render((60, 60), *place, flux=1000)
+                for place in zip(x, y, strict=True))
+    field = fit_mixture_field(
+        light + noise, QTable({'x': x, 'y': y, 'flux': np.full(9, 1000.0)}),
+        error=np.full((60, 60), 0.01), n_components=2, degree=0)
+    kinds = [images[0].psf, grid, field, GriddedMixturePSF([MIXTURE],
+                                                           [(0, 0)])]
+    mixed = [replace(image, psf=psf) for image, psf in zip(images, kinds,
+                                                           strict=True)]
+    want, got = (PixelMotionFitter().fit(some, star['ra', 'dec']).stars
+                 for some in (images, mixed))
+    away = offsets(got, star) - offsets(want, star)
+    assert (np.abs(away[0, 2:4]) < 0.05 * errors(want)[0, 2:4]).all()
+    # The centre of a field is its centroid, 0.03 pixels off the mixture's.
+    assert (np.abs(away[0, :2]) < 0.03 * SCALE / 4).all()
+    assert_allclose(got['flux'], want['flux'], rtol=5e-3)
+
+
 def test_images_of_other_units_are_converted(rng):
     star = truth(30.2, 29.6)
     images = observe(star, 2000.0, YEARS, rng)
@@ -494,3 +592,27 @@ def test_stars_too_faint_for_each_image_are_found_in_all(rng):
     assert len(np.unique(nearest[right])) > 0.9 * x.size
     more = PixelMotionFitter().find(images, stars['ra', 'dec'])
     assert len(more) <= 1
+
+
+def test_near_stars_are_found_if_parallaxes_are_searched(rng):
+    # Far apart in time by half a year the parallax is as large as it gets.
+    years = 2024.2 + 0.5 * np.arange(6)
+    stars = truth([22.0, 48.0], [24.0, 50.0], parallax=200.0)
+    flux = 4.0 * 3.0 / np.sqrt(np.sum(MIXTURE.render((21, 21), 10, 10)**2))
+    images = observe(stars, flux, years, rng, size=72)
+    place = SkyCoord(stars['ra'], stars['dec'])
+
+    def near(table):
+        return 0 if not len(table) else int((place.match_to_catalog_sky(
+            SkyCoord(table['ra'], table['dec']))[1] < 60 * u.mas).sum())
+
+    fitter = PixelMotionFitter(parallax=True)
+    found = fitter.find(images, max_parallax=300 * u.mas)
+    assert near(found) == 2
+    away = found['parallax'] - 200 * u.mas
+    assert (np.abs(away / found['parallax_error']) < 4).sum() >= 2
+    assert near(fitter.find(images)) < 2
+    with pytest.raises(ValueError, match='parallax=True only'):
+        PixelMotionFitter().find(images, max_parallax=300 * u.mas)
+    with pytest.raises(TypeError, match='max_parallax must be'):
+        fitter.find(images, max_parallax=3 * u.s)

@@ -103,3 +103,19 @@ def test_maps_of_a_run_show_what_they_were_given():
         'x_err': [1, 2, 3], 'y_err': [2, 3, 4]}, unit='pix', ax=axes[3])
     assert [line.get_label() for line in axes[3].lines] == ['x_err', 'y_err']
     assert axes[3].get_ylabel() == 'stated error [pix]'
+
+
+def test_a_radial_profile_is_the_mixture_along_a_ray(ax):
+    psf = make_grid()
+    plotting.plot_radial_profile(psf, 0, 0, radius=5, ax=ax)
+    distance, mean = ax.lines[0].get_data()
+    mixture = psf.mixture_at(0, 0)
+    along = [mixture.evaluate(distance * np.cos(t), distance * np.sin(t))
+             for t in np.linspace(0, 2 * np.pi, 72, endpoint=False)]
+    assert_allclose(mean, np.mean(along, axis=0))
+
+
+def test_a_residual_image_is_in_standard_errors(ax):
+    residual = np.arange(12.0).reshape(3, 4)
+    plotting.plot_residual_image(residual, np.full((3, 4), 2.0), ax=ax)
+    assert_allclose(ax.images[0].get_array(), residual / 2)

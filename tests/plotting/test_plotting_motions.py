@@ -78,7 +78,7 @@ def test_cutouts_show_each_image_three_times(axes, rng):
     table = QTable({'time': [2024.0, 2026.5], 'x': [10.0, 12.4],
                     'y': [7.0, 7.0], 'data': stamps[0], 'model': stamps[1],
                     'residual': stamps[2]})
-    plot_cutouts(axes, table)
+    plot_cutouts(table, ax=axes)
     shown = axes.images[0].get_array()
     assert shown.shape == (17, 11)
     scatter = 1.4826 * np.median(np.abs(stamps[2]), axis=(1, 2))
@@ -88,4 +88,4 @@ def test_cutouts_show_each_image_three_times(axes, rng):
     assert [text.get_text() for text in axes.get_xticklabels()] == [
         '2024.00', '2026.50']
     with pytest.raises(ValueError, match='at least one row'):
-        plot_cutouts(axes, table[:0])
+        plot_cutouts(table[:0], ax=axes)

@@ -1,0 +1,259 @@
+"""
+The tasks of a survey, run somewhere, and never twice.
+
+A task is file names in, files out: images do not travel. Its record has a
+digest of its commands, its version and its inputs; while nothing of these
+changes, and its outputs are there, it is not run again.
+"""
+import json
+import multiprocessing
+import time
+import warnings
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from photutils_mgauss.cli import tools
+from photutils_mgauss.cli.results import file_marks
+
+# A task whose worker died so often is not tried again.
+_TRIES = 4
+
+
+@dataclass(frozen=True)
+class Task:
+    """
+    Commands that belong together.
+
+    Attributes
+    ----------
+    name : str
+        What it is called, also its record's file.
+    commands : tuple of tuple of str
+        The words of each command, run one after the other.
+    inputs, outputs : tuple of str
+        Files that they read and write.
+    record : str
+        The file of its record.
+    """
+
+    name: str
+    commands: tuple
+    inputs: tuple
+    outputs: tuple
+    record: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a task ended: ``error`` is a sentence, empty if all went well."""
+
+    name: str
+    error: str = ''
+    seconds: float = 0.0
+    notes: tuple = ()
+    digest: str = ''
+    skipped: bool = False
+
+
+def run_task(task):
+    """
+    Run a task unless it is done; return its `Outcome`.
+
+    This is what workers do: it takes and returns plain values.
+    """
+    try:
+        digest = _digest(task)
+    except OSError as error:
+        return Outcome(task.name, tools.sentence_of(error))
+    known = kept_outcome(task)
+    if known is not None and known.digest == digest:
+        return known
+    start = time.perf_counter()
+    error, notes = _run(task)
+    outcome = Outcome(task.name, error, time.perf_counter() - start,
+                      tuple(notes), digest)
+    if not error:
+        with tools.whole_file(Path(task.record)) as draft:
+            draft.write_text(json.dumps(asdict(outcome)), encoding='utf-8')
+    return outcome
+
+
+def kept_outcome(task):
+    """Return the outcome in the record of a task that has its outputs."""
+    record = Path(task.record)
+    if not record.exists() or not all(map(_exists, task.outputs)):
+        return None
+    try:
+        kept = json.loads(record.read_text(encoding='utf-8'))
+        return Outcome(**{**kept, 'notes': tuple(kept['notes']),
+                          'skipped': True})
+    except (ValueError, TypeError, KeyError):
+        return None
+
+
+def _exists(path):
+    return Path(path).exists()
+
+
+def _digest(task):
+    """Return what stands for the commands, the version and the inputs."""
+    from photutils_mgauss.utils.checkpoint import digest_of
+    return digest_of(task.commands, file_marks(*task.inputs))
+
+
+def _run(task):
+    """Run the commands; return what went wrong, and the warnings."""
+    from photutils_mgauss.cli.survey_steps import step_parser
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('default')
+        for words in task.commands:
+            options = step_parser().parse_args([*words, '--quiet'])
+            try:
+                options.run(options)
+            except Exception as error:  # noqa: BLE001 it becomes a sentence
+                return tools.sentence_of(error), _notes(caught)
+    return '', _notes(caught)
+
+
+def _notes(caught):
+    """Return the warnings that users can do something about."""
+    return list(dict.fromkeys(
+        tools.one_line(str(one.message)) for one in caught
+        if not issubclass(one.category, (ResourceWarning, DeprecationWarning,
+                                         PendingDeprecationWarning,
+                                         FutureWarning))))
+
+
+class Inline:
+    """An executor that runs a task where it is submitted."""
+
+    def submit(self, function, *arguments):
+        """Run it, and return a future that is done."""
+        future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+    def shutdown(self, **_):
+        """Do nothing: there is nobody to send home."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """
+    Where tasks run.
+
+    Attributes
+    ----------
+    make : callable
+        Returns an executor; called again where one broke.
+    number : int
+        How many tasks are given to it at a time.
+    """
+
+    make: object
+    number: int
+
+
+def local_workers(number):
+    """Return so many processes of this machine, or this one for one."""
+    if number == 1:
+        return Workers(Inline, 1)
+    context = multiprocessing.get_context('spawn')
+    return Workers(lambda: ProcessPoolExecutor(number, mp_context=context),
+                   number)
+
+
+def cluster_workers(address):
+    """
+    Return the workers of a running Dask cluster.
+
+    Parameters
+    ----------
+    address : str
+        That of its scheduler, or the name of its scheduler file.
+
+    Returns
+    -------
+    Workers
+
+    Raises
+    ------
+    ValueError
+        If Dask is not installed, or has no workers.
+    """
+    try:
+        from dask.distributed import Client
+    except ImportError as error:
+        msg = ("--cluster needs Dask: pip install 'photutils_mgauss[dask]'")
+        raise ValueError(msg) from error
+    client = (Client(scheduler_file=address) if Path(address).is_file()
+              else Client(address, timeout=30))
+    number = sum(client.ncores().values())
+    if not number:
+        msg = f'--cluster must have workers, got none at {address}'
+        raise ValueError(msg)
+    # The same task may be asked for again after a failure.
+    return Workers(lambda: client.get_executor(pure=False), 2 * number)
+
+
+def run_tasks(tasks, workers, tell):
+    """
+    Run tasks, each by itself.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+        What to do.
+    workers : Workers
+        Where.
+    tell : callable
+        Called with the outcome of each task as it comes.
+
+    Returns
+    -------
+    dict of str to Outcome
+        By the names of the tasks. One that fails harms no other.
+    """
+    done, deaths = {}, {}
+    waiting, running = list(tasks), {}
+    executor = workers.make()
+    while waiting or running:
+        while waiting and len(running) < workers.number:
+            task = waiting.pop(0)
+            running[executor.submit(run_task, task)] = task
+        finished, _ = wait(running, return_when=FIRST_COMPLETED)
+        errors = []
+        for future in finished:
+            task, error = running.pop(future), future.exception()
+            outcome = future.result() if error is None else _after(
+                task, error, deaths)
+            if outcome is None:
+                waiting.insert(0, task)
+            else:
+                done[task.name] = outcome
+                tell(outcome)
+            errors.append(error)
+        if any(isinstance(error, BrokenProcessPool) for error in errors):
+            # A process that dies takes its pool along, not other tasks.
+            executor.shutdown(wait=False, cancel_futures=True)
+            waiting = [*running.values(), *waiting]
+            running.clear()
+            executor = workers.make()
+    executor.shutdown(wait=True)
+    return done
+
+
+def _after(task, error, deaths):
+    """Return the outcome of a task whose worker died, None to try again."""
+    deaths[task.name] = deaths.get(task.name, 0) + 1
+    if deaths[task.name] < _TRIES:
+        return None
+    return Outcome(task.name, f'its worker died {_TRIES} times: '
+                   f'{tools.sentence_of(error)}')

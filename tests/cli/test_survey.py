@@ -1,0 +1,237 @@
+"""A survey: its plan, its tasks, and what it leaves."""
+import json
+import os
+import re
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import QTable
+
+from photutils_mgauss import (
+    Instrument,
+    paper_exposures,
+    simulate_epochs,
+    sky_field,
+)
+from photutils_mgauss.cli import main
+from photutils_mgauss.cli.survey_plan import read_survey
+from photutils_mgauss.cli.survey_run import (
+    Outcome,
+    Task,
+    kept_outcome,
+    local_workers,
+    run_task,
+    run_tasks,
+)
+
+OPTIONS = ('[psf]\nn_components = 1\ndegree = 0\ngrid_shape = [1, 1]\n'
+           '[motions]\nreferences = "quasars.ecsv"\n')
+PLACES = {'north': (192.8595, 27.3283), 'south': (192.8595, 27.1283)}
+
+
+@pytest.fixture(scope='module')
+def images(tmp_path_factory):
+    """Write two epochs of two fields, and their quasars."""
+    folder = tmp_path_factory.mktemp('survey')
+    (folder / 'raw').mkdir()
+    quasars = []
+    for k, (name, (ra, dec)) in enumerate(PLACES.items()):
+        sources = sky_field(60, 40, ra=ra, dec=dec, size=0.4, rng=k,
+                            magnitudes=(18, 21), separation=1,
+                            parallaxes=False)
+        exposures = paper_exposures(ra, dec, offset=0.5)
+        scenes = simulate_epochs(sources, [exposures[0], exposures[6]],
+                                 instrument=Instrument(shape=(260, 250)),
+                                 rng=k)
+        for number, scene in enumerate(scenes):
+            write(folder / 'raw' / f'{name}{number}.fits', scene)
+        some = sources[sources['kind'] == 'qso']['ra', 'dec']
+        some['class'] = 'qso'
+        quasars.append(some)
+    from astropy.table import vstack
+    vstack(quasars).write(folder / 'quasars.ecsv')
+    return folder
+
+
+def write(path, scene):
+    header = scene.wcs.to_fits_sip(
+        bounding_box=((-0.5, 249.5), (-0.5, 259.5)))
+    header['MJD-AVG'] = scene.time.mjd
+    header['BUNIT'] = 'electron'
+    fits.HDUList([
+        fits.PrimaryHDU(),
+        fits.ImageHDU(scene.image.astype('f4'), header, name='SCI'),
+        fits.ImageHDU(scene.error.astype('f4'), name='ERR'),
+        fits.ImageHDU(scene.mask.astype('i2'), name='DQ')]).writeto(path)
+
+
+@pytest.fixture
+def survey(images, tmp_path):
+    """Return a survey file of its own, for the same images."""
+    path = tmp_path / 'survey.toml'
+    path.write_text(f'[exposures]\nfiles = "{images}/raw/*.fits"\n'
+                    + OPTIONS.replace('quasars', f'{images}/quasars'))
+    return path
+
+
+def test_exposures_that_overlap_are_a_field(survey):
+    plan = read_survey(survey)
+    names = [one.name for one in plan.exposures]
+    assert names == ['north0', 'north1', 'south0', 'south1']
+    assert list(plan.fields.values()) == [[0, 1], [2, 3]]
+    assert plan.options['psf'][:4] == ('--n-components', '1', '--degree', '0')
+
+
+def test_the_dry_run_shows_the_plan_and_writes_nothing(survey, capsys):
+    assert main(['survey', str(survey), '--dry-run']) == 0
+    said = capsys.readouterr().out
+    assert '4 exposures in 2 fields' in said
+    assert re.search(r'field0001: 2 exposures, \d{4}.*north0, north1', said)
+    assert sorted(survey.parent.iterdir()) == [survey]
+
+
+def test_a_survey_ends_in_motions_and_runs_only_what_changed(survey, capsys):
+    pytest.importorskip('pyarrow')
+    assert main(['survey', str(survey), '--workers', '1']) == 0
+    folder = survey.parent / 'survey'
+    said = capsys.readouterr().out
+    assert '4 exposures, 2 fields, 0 failed, 0 of an earlier run' in said
+    stars = {}
+    for field in ('field0001', 'field0002'):
+        table = QTable.read(folder / 'motions' / field / 'motions.ecsv')
+        assert np.isfinite(table['pmra_error'].value).sum() > 20
+        stars[field] = np.isfinite(table['ra'].value).sum()
+    from pyarrow import dataset
+    whole = dataset.dataset(folder / 'motions_hats' / 'dataset',
+                            format='parquet').to_table()
+    assert whole.num_rows == sum(stars.values())
+    assert whole.schema.field('pmra').metadata[b'unit'] == b'mas / yr'
+    index = whole['_healpix_29'].to_numpy()
+    assert index.dtype == np.int64
+    page = (folder / 'index.html').read_text()
+    assert page.count('<tr') == 2 + 4 + 2
+    # Nothing changed, so nothing is done again.
+    before = stamps(folder)
+    assert main(['survey', str(survey), '--workers', '1']) == 0
+    assert '0 failed, 6 of an earlier run' in capsys.readouterr().out
+    assert stamps(folder) == before
+    # One image changed: it and its field.
+    plan = read_survey(survey)
+    os.utime(plan.exposures[0].path)
+    assert main(['survey', str(survey), '--workers', '1']) == 0
+    assert '0 failed, 4 of an earlier run' in capsys.readouterr().out
+    assert json.loads((folder / 'summary.json').read_text())['kept'] == 4
+
+
+def stamps(folder):
+    return {path: path.stat().st_mtime_ns
+            for name in ('psfs', 'catalogues', 'motions', 'records')
+            for path in (folder / name).rglob('*') if path.is_file()}
+
+
+def test_a_failed_exposure_is_listed_and_stops_nothing(survey, images,
+                                                       tmp_path, capsys):
+    (tmp_path / 'raw').mkdir()
+    for path in (images / 'raw').glob('south*'):
+        (tmp_path / 'raw' / path.name).write_bytes(path.read_bytes())
+    with fits.open(images / 'raw' / 'north0.fits') as hdus:
+        hdus['SCI'].data[:] = np.random.default_rng(1).normal(
+            100, 10, hdus['SCI'].data.shape)
+        hdus.writeto(tmp_path / 'raw' / 'noise.fits')
+    survey.write_text('[exposures]\nfiles = ["raw/*.fits"]\n'
+                      + OPTIONS.replace('quasars', f'{images}/quasars'))
+    assert main(['survey', str(survey), '--workers', '1']) == 1
+    said = capsys.readouterr()
+    assert 'noise.fits: data must show at least 1 source' in said.out
+    assert 'lists what failed; the rest is finished' in said.err
+    folder = tmp_path / 'survey'
+    assert len(list((folder / 'motions').glob('*/motions.ecsv'))) == 1
+    page = (folder / 'index.html').read_text()
+    assert page.index('noise') < page.index('south0')
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    ('[exposure]\n', 'keys must be among .* got exposure'),
+    ('[exposures]\nfiles = ["none/*.fits"]\n', 'must name images, got none'),
+    ('[exposures]\nfiels = 1\n', r'did you mean files\?'),
+    ('[psf]\ncolour = 3\n', (r'\[psf\] must have options of mgauss psf, got '
+     'colour')),
+    ('[photometry]\nfit_shape = "x"\n', r'\[photometry\]: .*fit-shape'),
+    ('[exposures\n', 'must be a TOML file')])
+def test_what_is_wrong_in_the_file_is_named(tmp_path, text, said):
+    path = tmp_path / 'survey.toml'
+    path.write_text(text)
+    with pytest.raises(ValueError, match=said):
+        read_survey(path)
+
+
+def test_two_exposures_of_one_name_are_refused(images, tmp_path):
+    (tmp_path / 'more').mkdir()
+    copy = tmp_path / 'more' / 'north0.fits'
+    copy.write_bytes((images / 'raw' / 'north0.fits').read_bytes())
+    path = tmp_path / 'survey.toml'
+    path.write_text(f'[exposures]\nfiles = ["{images}/raw/north0.fits", '
+                    '"more/*.fits"]\n')
+    with pytest.raises(ValueError, match='different names, got north0 for'):
+        read_survey(path)
+
+
+def test_an_image_without_a_wcs_is_named_before_work_starts(tmp_path):
+    fits.writeto(tmp_path / 'bare.fits', np.ones((50, 50)),
+                 fits.Header({'BUNIT': 'electron'}))
+    path = tmp_path / 'survey.toml'
+    path.write_text('[exposures]\nfiles = "*.fits"\n')
+    with pytest.raises(ValueError, match=r'bare.fits: must have a WCS'):
+        read_survey(path)
+
+
+def test_the_example_is_for_the_images_of_a_folder(images, tmp_path,
+                                                   monkeypatch):
+    monkeypatch.chdir(images)
+    assert main(['survey', '--init', 'raw']) == 0
+    try:
+        assert len(read_survey(images / 'survey.toml').exposures) == 4
+        assert main(['survey', '--init', 'raw']) == 1  # it is there already
+    finally:
+        (images / 'survey.toml').unlink()
+
+
+def make_task(folder, name='info'):
+    source = folder / 'stars.ecsv'
+    if not source.exists():
+        QTable({'x': [1.0]}).write(source)
+    return Task(name, (('info', str(source)),), (str(source),), (),
+                str(folder / f'{name}.json'))
+
+
+def test_a_task_runs_once_until_something_it_reads_changes(tmp_path):
+    task = make_task(tmp_path)
+    assert not run_task(task).skipped
+    assert run_task(task).skipped
+    os.utime(task.inputs[0])
+    assert not run_task(task).skipped
+    (tmp_path / 'info.json').write_text('{')
+    assert kept_outcome(task) is None
+    assert 'no such' in run_task(Task(
+        'gone', (), (str(tmp_path / 'gone'),), (), 'x')).error.lower()
+
+
+def _kill_once(task):
+    """Take the process down, the first time."""
+    mark = task.record + '.mark'
+    if not os.path.exists(mark):  # noqa: PTH110
+        with open(mark, 'w'):  # noqa: PTH123
+            os.kill(os.getpid(), 9)
+    return Outcome(task.name, seconds=1.0)
+
+
+def test_a_worker_that_dies_loses_nothing(tmp_path, monkeypatch):
+    from photutils_mgauss.cli import survey_run
+    monkeypatch.setattr(survey_run, 'run_task', _kill_once)
+    tasks = [make_task(tmp_path, f'task{k}') for k in range(3)]
+    told = []
+    done = run_tasks(tasks, local_workers(2), told.append)
+    assert sorted(done) == ['task0', 'task1', 'task2']
+    assert not any(outcome.error for outcome in done.values())
+    assert len(told) == 3
