@@ -54,6 +54,7 @@ UCDS = {
 GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
 STRONG = 0.3
 EACH = 50  # stars of like flux that tell what is usual
+MOST_GROUPS = 100
 
 
 def visibility_periods(sightings, used):
@@ -266,14 +267,14 @@ def _renormalised(chi2, dof, flux):
     """
     known = np.flatnonzero((dof > 0) & (flux > 0) & np.isfinite(chi2))
     out = np.full(len(chi2), np.nan)
-    n_groups = len(known) // EACH
+    n_groups = min(len(known) // EACH, MOST_GROUPS)
     if not n_groups:
         return out
     ratio = np.asarray(chi2)[known] / chdtri(np.asarray(dof)[known], 0.5)
-    order = np.argsort(flux[known])
-    groups = np.array_split(order, n_groups)
-    at = [np.median(np.log(flux[known][some])) for some in groups]
-    usual = np.interp(np.log(flux[known]), at,
+    size = np.log(flux[known])
+    groups = np.array_split(np.argsort(size), n_groups)
+    at = [np.median(size[some]) for some in groups]
+    usual = np.interp(size, at,
                       [np.median(ratio[some]) for some in groups])
     out[known] = np.sqrt(np.asarray(chi2)[known] / np.asarray(dof)[known]
                          / np.where(usual > 0, usual, np.nan))
