@@ -110,11 +110,20 @@ def _read_psf(path, checkpoint):
 def make(options, image, model, name, **more):
     """Return the catalogue of an image, and what writes it."""
     tools.say(options, image.describe())
+    if image.saturation is not None:
+        tools.say(options, f'{image.path}: {image.say_saturation()}')
     table = measure(image, model, options)
-    tools.say(options, f'{image.path}: {len(table)} stars')
+    tools.say(options, f'{image.path}: {len(table)} stars'
+                       f'{_saturated(table)}')
     return table, partial(tools.write_table, table, record=tools.record_of(
         options, exposure=exposure(image, name),
         reading=image.layers.sources, **more))
+
+
+def _saturated(table):
+    from photutils_mgauss.utils.flags import SATURATED
+    n = int(((table['flags'] & SATURATED) > 0).sum())
+    return f', {n} of them saturated or masked, from their wings' if n else ''
 
 
 def measure(image, psf, options):
@@ -159,7 +168,7 @@ def _sparse(image, psf, options):
     photometry = MixturePSFPhotometry(
         psf, options.fit_shape, finder=finder,
         aperture_radius=max(2.0, 1.5 * fwhm), effective_gain=noise.gain,
-        xy_cov=True)
+        xy_cov=True, saturation=image.saturation_without_sky)
     return photometry(image.without_sky, error=noise.background,
                       mask=image.mask)
 
@@ -170,7 +179,8 @@ def _crowded(image, psf, options):
         psf = _own_psf(image, options)
     photometry = CrowdedMixturePhotometry(
         psf, threshold=options.threshold or 4.5,
-        effective_gain=image.noise.gain, checkpoint=options.checkpoint)
+        effective_gain=image.noise.gain, checkpoint=options.checkpoint,
+        saturation=image.saturation)
     return photometry(image.data, error=image.noise.total, mask=image.mask)
 
 

@@ -131,6 +131,22 @@ class StarImage:
         """The level of saturated pixels, or None."""
         return self._or_header('saturation')
 
+    @property
+    def saturation_without_sky(self):
+        """The same without the median of the sky, or None."""
+        if self.saturation is None:
+            return None
+        level = self.saturation - float(self.sky.background_median)
+        return level if level > 0 else None
+
+    def say_saturation(self):
+        """Return a sentence on what is saturated."""
+        source = ('--saturation' if self.reading.saturation is not None
+                  else 'the header')
+        n = int(np.count_nonzero(self.data >= self.saturation))
+        return (f'pixels from {self.saturation:g} on are saturated, as '
+                f'{source} says: {n} of them')
+
     def _or_header(self, name):
         own = getattr(self.reading, name)
         return getattr(self.layers.cards, name) if own is None else own

@@ -141,9 +141,9 @@ def _words(options, folder):
 
 def _check_words(path, command, words):
     """Raise if a command does not know its options."""
-    from photutils_mgauss.cli.command import make_parser
+    from photutils_mgauss.cli.survey_steps import step_parser
     said = io.StringIO()
-    parser = make_parser()
+    parser = step_parser()
     with contextlib.redirect_stderr(said):
         try:
             _, unknown = parser.parse_known_args([command, 'x', *words])

@@ -110,11 +110,11 @@ def _digest(task):
 
 def _run(task):
     """Run the commands; return what went wrong, and the warnings."""
-    from photutils_mgauss.cli.command import make_parser
+    from photutils_mgauss.cli.survey_steps import step_parser
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter('default')
         for words in task.commands:
-            options = make_parser().parse_args([*words, '--quiet'])
+            options = step_parser().parse_args([*words, '--quiet'])
             try:
                 options.run(options)
             except Exception as error:  # noqa: BLE001 it becomes a sentence

@@ -3,6 +3,7 @@ import numpy as np
 from scipy.ndimage import find_objects, label
 
 from photutils_mgauss.crowded.stars import Stars
+from photutils_mgauss.psf.wings import WINGS, place_behind
 
 # Groups of bad pixels of up to this many may hide a saturated star.
 _SATURATED_PIXELS = (2, 2000)
@@ -10,7 +11,7 @@ _SATURATED_PIXELS = (2, 2000)
 
 def saturated_stars(model):
     """Return a star for each clump of bad pixels that has a star's wings."""
-    clumps, n = label(~model.good)
+    clumps, n = label(~model.good, np.ones((3, 3)))
     size = np.bincount(clumps.ravel(), minlength=n + 1)[1:]
     low, high = _SATURATED_PIXELS
     data = model.data - model.background()
@@ -22,10 +23,12 @@ def saturated_stars(model):
 
 
 def _wing_star(model, data, box, clump):
-    y, x = np.nonzero(clump)
-    y, x = y + box[0].start, x + box[1].start
-    column, row = round(x.mean()), round(y.mean())
-    half = int(max(np.ptp(x), np.ptp(y)) / 2) + 6
+    x, y, core, wings = place_behind(model.psf, data, model.weight, box,
+                                     clump)
+    if wings is None:
+        return None
+    column, row = round(x), round(y)
+    half = core + WINGS
     ny, nx = model.data.shape
     part = (slice(max(0, row - half), min(ny, row + half + 1)),
             slice(max(0, column - half), min(nx, column + half + 1)))
@@ -46,8 +49,8 @@ def _wing_star(model, data, box, clump):
     significance = flux * np.sqrt(info)
     if significance < 10 * model.options.threshold:
         return None
-    return Stars([x.mean()], [y.mean()], [flux], significance=significance,
-                 seeded=True)
+    return Stars([x], [y], [flux], significance=significance, seeded=True,
+                 core=core)
 
 
 def size_differences(model):

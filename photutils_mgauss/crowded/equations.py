@@ -65,6 +65,18 @@ class Equations:
             np.empty((n, 3, 3)), np.empty((4, step.size)), step)
         return step[:3 * n].reshape(n, 3), step[3 * n:]
 
+    def answers_to_light(self):
+        """Return by how much fluxes (n,) rise if a pixel has 1 more."""
+        n = len(self.stars.matrix)
+        stars = self.stars._replace(gradient=self.stars.coupling,
+                                    coupling=np.zeros((n, 3)))
+        mesh = self.mesh._replace(gradient=0 * self.mesh.gradient)
+        step = np.zeros(3 * n + mesh.gradient.size)
+        kernels.solve_joint(
+            stars, self.neighbours.pairs, mesh, _TOLERANCE, _CG_STEPS,
+            np.empty((n, 3, 3)), np.empty((4, step.size)), step)
+        return step[:3 * n:3]
+
     def covariances(self):
         """Return covariances with neighbours free, and correlations."""
         n = len(self.stars.matrix)

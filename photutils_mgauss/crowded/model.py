@@ -18,6 +18,7 @@ from photutils_mgauss.crowded.background import Mesh
 from photutils_mgauss.crowded.diffuse import Diffuse
 from photutils_mgauss.crowded.stars import Neighbours, Stars
 from photutils_mgauss.psf.local import MAX_WING
+from photutils_mgauss.psf.wings import WINGS
 
 # Fit stamps are 7 or 9 pixels wide, 13 for bright stars: almost all of the
 # information on a position lies in the core.
@@ -118,7 +119,9 @@ class Model:
         bright = flux * profile[0] > _BRIGHT_FLUX * self.noise
         half = np.clip(wing, _MIN_HALF, np.where(
             bright, _BRIGHT_HALF, _MAX_HALF))
-        half[s.seeded[chosen]] = _BRIGHT_HALF + 2
+        seeded = s.seeded[chosen]
+        half[seeded] = np.maximum(_BRIGHT_HALF + 2,
+                                  s.core[chosen][seeded] + WINGS)
         width = 2 * half + 1
         ends = np.concatenate([[0], np.cumsum(width**2)]).astype(np.int64)
         return np.maximum(wing, half).astype(np.int64), kernels.Stamps(

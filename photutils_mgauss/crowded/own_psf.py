@@ -1,12 +1,11 @@
 """The PSF of a crowded image, from nothing but the image."""
-from dataclasses import replace
-
 import numpy as np
 
 from photutils_mgauss.crowded.photometry import CrowdedMixturePhotometry
 from photutils_mgauss.crowded.psf_loop import LoopOptions
 from photutils_mgauss.crowded.psf_stars import Rules
-from photutils_mgauss.utils.image import read_level, read_pixels
+from photutils_mgauss.utils.image import read_pixels
+from photutils_mgauss.utils.saturation import as_saturation, without_saturated
 from photutils_mgauss.utils.star_columns import read_sources
 from photutils_mgauss.utils.validation import as_integer, as_real
 
@@ -119,10 +118,7 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
         given = np.column_stack([sources.x, sources.y])[sources.selected]
         given = given[np.isfinite(given).all(axis=1)]
     if saturation is not None:
-        level = read_level(saturation, 'saturation', image.unit)
-        too_bright = image.data >= level
-        image = replace(image, mask=too_bright if image.mask is None
-                        else image.mask | too_bright)
+        image = without_saturated(image, as_saturation(saturation))
     rules = Rules(
         radius=as_real(radius, 'radius', minimum=5),
         max_stars=as_integer(max_stars, 'max_stars', minimum=1),

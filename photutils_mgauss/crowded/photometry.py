@@ -27,6 +27,7 @@ from photutils_mgauss.utils.checkpoint import Checkpoint
 from photutils_mgauss.utils.flags import REPEATED, decode
 from photutils_mgauss.utils.image import read_pixels, with_unit
 from photutils_mgauss.utils.per_thread import PerThread, keep
+from photutils_mgauss.utils.saturation import as_saturation, without_saturated
 from photutils_mgauss.utils.star_columns import column_values, read_sources
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
@@ -34,6 +35,9 @@ __all__ = ['CrowdedMixturePhotometry', 'UnfinishedTilesError']
 
 # A PSF whose size is off by more than this fraction is warned of.
 _WIDTH_TOLERANCE = 0.1
+_CONFUSION = ('errors and fluxes allow for stars that were not found; what of '
+              'their light the background takes is calibrated with artificial '
+              'stars')
 # Stars are drawn out to where this fraction of the noise is left of them.
 _FAINTEST = 1e-3
 
@@ -152,6 +156,15 @@ class CrowdedMixturePhotometry:
         Whether the errors contain what the PSF may be off, if ``psf_model``
         knows that, as the grid of a `MixtureField` does; see
         `MixturePSFPhotometry`. Each star is taken by itself for this.
+    confusion : bool, optional
+        Whether errors and fluxes allow for stars that are too faint or too
+        close to others to be found, in the number that the stars around tell.
+        Not where ``find_neighbors`` is False: then a list has all stars.
+    saturation : float or `~astropy.units.Quantity`, optional
+        The level from which pixels are saturated, in the unit of the data.
+        If given, such pixels are masked, with the trails along rows and
+        columns that their charge has run into and a pixel around them. Stars
+        behind masked pixels are fitted to their wings in any case.
     find_neighbors : bool, optional
         Whether stars that are missing from a given list are found and fitted
         together with those on it. They are not reported. Otherwise the list
@@ -180,7 +193,10 @@ class CrowdedMixturePhotometry:
     -----
     Columns beside photutils' own: ``xy_cov``, the covariance of x and y
     [pix^2]; ``x_psf_err``, ``y_psf_err`` and ``flux_psf_err``, the part of the
-    errors that is due to the PSF, if it is known; ``significance`` of the
+    errors that is due to the PSF, if it is known; ``x_confusion_err``,
+    ``y_confusion_err`` and ``flux_confusion_err``, that of stars that were not
+    found, and ``flux_confusion``, what of their light has been taken off
+    ``flux_fit``; ``significance`` of the
     detection; ``crowding``, the star's share of the light of all stars in its
     fit pixels; ``neighbor_distance`` [pix] and ``neighbor_correlation``, the
     correlation with the nearest neighbour's flux; ``iter_detected``. Bits of
@@ -220,7 +236,7 @@ class CrowdedMixturePhotometry:
                  effective_gain=None, maxiters=3, tile_shape=None,
                  overlap=128, executor=None, progress_bar=False,
                  find_neighbors=True, xy_bounds=1.0, checkpoint=None,
-                 psf_errors=True):
+                 psf_errors=True, confusion=True, saturation=None):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
         self.keep = as_real(keep, 'keep', minimum=0)
@@ -251,6 +267,8 @@ class CrowdedMixturePhotometry:
         self.results = self.field = None
         self._noise = np.inf
         self.psf_errors = bool(psf_errors)
+        self.confusion = bool(confusion)
+        self.saturation = as_saturation(saturation)
         self.psf_used = psf_model
         self._psf = None if psf_model is None else LocalPSF.of(psf_model)
 
@@ -296,7 +314,8 @@ class CrowdedMixturePhotometry:
         UnfinishedTilesError
             If a worker failed; the finished tiles are in the error.
         """
-        image = read_pixels(data, error, mask).with_error()
+        image = without_saturated(read_pixels(data, error, mask),
+                                  self.saturation).with_error()
         given = (None if init_params is None
                  else self._listed(init_params, image.unit))
         psf = self._psf_of(image)
@@ -348,8 +367,9 @@ class CrowdedMixturePhotometry:
         """Return the same photometry with a PSF and other settings."""
         same = {name: getattr(self, name) for name in (
             'count_slope', 'background_size', 'maxiters', 'tile_shape',
-            'overlap', 'executor', 'checkpoint')}
-        return type(self)(psf_model, psf_errors=False, **same | changes)
+            'overlap', 'executor', 'checkpoint', 'saturation')}
+        return type(self)(psf_model, psf_errors=False, confusion=False,
+                          **same | changes)
 
     def _listed(self, init_params, unit):
         x, y, flux, number = _given(init_params, unit)
@@ -374,7 +394,8 @@ class CrowdedMixturePhotometry:
             noise=float(np.sqrt(np.median(variance))),
             max_rounds=self.maxiters, find_neighbors=self.find_neighbors,
             xy_bounds=self._bound,
-            depth=self.depth, count_slope=self.count_slope)
+            depth=self.depth, count_slope=self.count_slope,
+            confusion=self.confusion)
 
     def _table(self, outcomes, given, unit):
         """Put the stars of the tiles together; empties the list."""
@@ -388,7 +409,9 @@ class CrowdedMixturePhotometry:
             stars = _in_given_order(stars, given)
         else:
             stars.sort('y', 'x')
-        return as_qtable(stars, unit, meta)
+        if self.confusion:
+            meta['confusion'] = _CONFUSION
+        return as_qtable(stars, unit, meta, confusion=self.confusion)
 
     def _report(self, done, stars):
         widths = np.concatenate([o.widths for o in done]) if done else []

@@ -272,7 +272,8 @@ def first_field(image, rules):
     stars['selected'][weak] = False
     return fit_mixture_field(
         data, stars, error=np.sqrt(variance), n_components=2, degree=0,
-        radius=psf_stars.FIRST_RADIUS, local_bkg=True, brighter_fatter=False)
+        radius=psf_stars.FIRST_RADIUS, local_bkg=True, normalise='stamps',
+        brighter_fatter=False)
 
 
 def _found_in(window, data, variance, rules):
@@ -304,7 +305,7 @@ def next_field(image, field, number, options, solve):
         n_components=options.n_components,
         degree=options.degree_of(number, len(used)),
         radius=options.radius(number), local_bkg=number < _OWN_SKY,
-        effective_gain=np.inf, brighter_fatter=False)
+        effective_gain=np.inf, normalise='stamps', brighter_fatter=False)
     return _with_reasons(new, stars)
 
 

@@ -14,7 +14,7 @@ _HINT = 0.4
 # the known one free to move; where less than this fraction of the
 # information is left, the two cannot be told apart.
 _REACH = 2.3
-_LEAST = 0.05
+LEAST = 0.05
 # No star is added this close to another, or to one that was taken away [pix].
 _SEPARATION = 0.3
 _REJECTED = 0.5
@@ -49,7 +49,7 @@ def _scores(tile, threshold):
     fit = kernels.Fit(model.stars.sources, model.stamps,
                       model.neighbours.pairs, tile.equations.stars)
     kernels.score_beside(fit, templates, model.planes(light),
-                         kernels.Limits(_REACH, _LEAST, float(threshold)),
+                         kernels.Limits(_REACH, LEAST, float(threshold)),
                          significance, flux)
     return significance, flux
 

@@ -17,19 +17,20 @@ class Stars:
 
     Every attribute is a column. Positions are pixels of the tile or of the
     image; ``number`` is the row of the user's list, -1 for stars found.
-    ``bound`` is how far from its first place a star may go [pix], ``hold``
+    ``core`` is how far from the middle of a saturated star pixels are hidden,
+    ``bound`` how far from its first place a star may go [pix], ``hold``
     the inverse variance with which it is held there.
 
     Parameters
     ----------
     x, y, flux : (n,) array_like
         Also what the stars start from, ``x_init`` to ``flux_init``.
-    significance, found_in, number, seeded, bound, hold : optional
+    significance, found_in, number, seeded, core, bound, hold : optional
         Columns, or what all stars have in them.
     """
 
     def __init__(self, x, y, flux, *, significance=0, found_in=0, number=-1,
-                 seeded=False, bound=np.inf, hold=0):
+                 seeded=False, core=0, bound=np.inf, hold=0):
         n = len(x)
         self.x, self.y, self.flux = (np.array(v, float) for v in (x, y, flux))
         self.x_init, self.y_init = self.x.copy(), self.y.copy()
@@ -38,6 +39,7 @@ class Stars:
         self.found_in = np.zeros(n, int) + found_in
         self.number = np.zeros(n, int) + number
         self.seeded = np.zeros(n, bool) | seeded
+        self.core = np.zeros(n, int) + core
         self.bound, self.hold = np.zeros(n) + bound, np.zeros(n) + hold
 
     @classmethod

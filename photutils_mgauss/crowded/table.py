@@ -3,6 +3,7 @@ import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss import kernels
+from photutils_mgauss.crowded.confusion import Confusion
 from photutils_mgauss.crowded.judge import smooth_light
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.utils.flags import (
@@ -28,6 +29,10 @@ _BLEND_CORRELATION = 0.5
 _BAD_CHI2, _BAD_SHARE = 3.0, 0.5
 
 
+# What hidden stars do, of `Confusion`.
+CONFUSION = ('x_confusion_err', 'y_confusion_err', 'flux_confusion_err',
+             'flux_confusion')
+
 # The columns of the table beside id and groups, as of `Stars`, and their
 # names where these are not photutils'.
 _COLUMNS = (
@@ -38,10 +43,11 @@ _COLUMNS = (
     ('qfit', float), ('cfit', float), ('reduced_chi2', float),
     ('flags', int), ('significance', float), ('crowding', float),
     ('neighbor_distance', float), ('neighbor_correlation', float),
-    ('found_in', int))
+    ('found_in', int), *((name, float) for name in CONFUSION))
 _NAMES = {'x': 'x_fit', 'y': 'y_fit', 'flux': 'flux_fit',
           'found_in': 'iter_detected'}
-_LIGHT = ('local_bkg', 'flux_init', 'flux', 'flux_err')
+_LIGHT = ('local_bkg', 'flux_init', 'flux', 'flux_err', 'flux_confusion_err',
+          'flux_confusion')
 
 
 def no_stars():
@@ -56,7 +62,8 @@ def tabulate(tile, core):
     s = model.stars
     quality = _quality(model)
     covariance, correlation = tile.equations.covariances()
-    covariance = covariance * _confusion(quality)[:, None, None]
+    hidden = _hidden(tile, covariance)
+    covariance = covariance * _misfit(quality)[:, None, None]
     with np.errstate(invalid='ignore'):
         error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     count, chi2, deviation, centre, crowding, _ = quality.T
@@ -65,8 +72,8 @@ def tabulate(tile, core):
                          out=np.zeros(len(s)))
     measured = s.replaced(
         local_bkg=model.background_at(s.x, s.y),
-        x_err=error[:, 1], y_err=error[:, 2], flux_err=error[:, 0],
-        xy_cov=covariance[:, 1, 2], n_pixels_fit=count.astype(int),
+        **_with_hidden(s, error, covariance[:, 1, 2], hidden),
+        n_pixels_fit=count.astype(int),
         qfit=deviation / flux, cfit=centre / flux,
         reduced_chi2=chi2 / np.maximum(count - 3, 1),
         flags=_flags(tile, quality, error, correlation),
@@ -121,16 +128,39 @@ def _quality(model):
     return out
 
 
-def _confusion(quality):
+def _misfit(quality):
     """
-    Return the factor of the variance for light that is in no star's model.
+    Return the factor of the variance where the model does not fit.
 
-    What is left of faint, undetected stars in a stamp raises its chi2.
+    What noise alone makes of chi2 once in some 40 stamps is no misfit.
     """
     count, chi2 = quality[:, 0], quality[:, 1]
-    # Each star has taken about three degrees of freedom from its stamp; six
-    # pixels' worth of prior keeps small numbers from swinging.
-    return np.maximum((chi2 + 6) / np.maximum(count + 3, 6), 1.0)
+    # Each star has taken about three degrees of freedom from its stamp.
+    free = np.maximum(count - 3, 3)
+    return np.maximum(chi2 / (free + np.sqrt(8 * free)), 1.0)
+
+
+def _hidden(tile, covariance):
+    """Return what stars that were not found do to those that were."""
+    options, n = tile.options, len(tile.model.stars)
+    if not options.confusion or not options.find_neighbors:
+        return Confusion.none(n)
+    with np.errstate(invalid='ignore'):
+        error = np.sqrt(covariance[:, 0, 0])
+    return Confusion.of(tile, error)
+
+
+def _with_hidden(stars, error, xy_cov, hidden):
+    """Return flux and errors as columns, hidden stars considered."""
+    more = hidden.flux, hidden.position, hidden.position
+    added = [err * part for err, part in zip(error.T, more, strict=True)]
+    total = [np.hypot(err, part)
+             for err, part in zip(error.T, added, strict=True)]
+    return {'flux': stars.flux - hidden.light, 'flux_err': total[0],
+            'x_err': total[1], 'y_err': total[2],
+            'xy_cov': xy_cov * (1 + hidden.position**2),
+            'flux_confusion_err': added[0], 'x_confusion_err': added[1],
+            'y_confusion_err': added[2], 'flux_confusion': hidden.light}
 
 
 def _flags(tile, quality, error, correlation):
@@ -148,12 +178,20 @@ def _flags(tile, quality, error, correlation):
             (NOT_SEEN, s.listed & ~(s.flux > tile.options.keep
                                     * error[:, 0])),
             (NO_COVARIANCE, ~np.isfinite(error).all(axis=1)),
-            (SATURATED, (quality[:, 5] < 0.5)),
+            (SATURATED, (quality[:, 5] < 0.5) | _is_hidden(tile.model)),
             (NOT_A_STAR, (smooth_light(tile.model)
                           | _unlike_a_star(s.flux, quality))),
             (BLENDED, np.abs(correlation) > _BLEND_CORRELATION)):
         flags[where] |= bit
     return flags
+
+
+def _is_hidden(model):
+    """Tell which stars started from their wings and have no middle pixel."""
+    s, (ny, nx) = model.stars, model.data.shape
+    return s.seeded & ~model.good[
+        np.clip(np.rint(s.y).astype(int), 0, ny - 1),
+        np.clip(np.rint(s.x).astype(int), 0, nx - 1)]
 
 
 def _unlike_a_star(flux, quality):
@@ -163,9 +201,12 @@ def _unlike_a_star(flux, quality):
             & (deviation > _BAD_SHARE * flux))
 
 
-def as_qtable(stars, unit, meta):
+def as_qtable(stars, unit, meta, *, confusion=True):
     """Return the stars as photutils' table; empties what is given."""
     columns = vars(stars)
+    if not confusion:
+        for name in CONFUSION:
+            del columns[name]
     n = columns.pop('number').size
     out = QTable(meta=meta)
     out['id'] = np.arange(1, n + 1)

@@ -35,6 +35,7 @@ class TileOptions:
     xy_bounds: float = np.inf
     depth: float = np.inf
     count_slope: float = 0.0
+    confusion: bool = False
 
     @property
     def faintest(self):

@@ -14,11 +14,11 @@ added to the covariances of star s, its own numbers eliminated, and
 It counts if it is significant both by the noise of pixels and by how much the
 stars scatter about it, which a PSF that is not quite right makes larger.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from photutils_mgauss.field.normal import equations
+from photutils_mgauss.field.normal import equations, model_stamps
 from photutils_mgauss.field.stages import added_shapes
 
 # Of chi^2 with three degrees of freedom, by chance once in 60,000 fields.
@@ -67,23 +67,49 @@ def measure_fattening(fit, workers):
         None if there are too few stars or their fluxes are the same.
     """
     used = np.flatnonzero(fit.problem.used)
-    before = np.zeros(3) if fit.fattening is None else fit.fattening
-    tuned, scale = added_shapes(fit, with_flux=True)
-    if (used.size < _FEWEST_STARS
-            or np.std(tuned.basis[used, -1]) < _LEAST_SPREAD):
+    flux = fit.fluxes()
+    scale = float(max(flux[used].max(), 1e-300))
+    if used.size < _FEWEST_STARS or np.std(flux[used]) < (_LEAST_SPREAD
+                                                          * scale):
         return None
-    order = used[np.argsort(tuned.basis[used, -1])]
+    order = used[np.argsort(flux[used])]
     stars = order[np.linspace(0, order.size - 1, min(
         order.size, _MOST_STARS)).astype(int)]
-    design = tuned.basis[stars]
+    tuned = replace(added_shapes(fit), weights=_even_weights(
+        fit, np.median(flux[used])))
+    design = np.column_stack([tuned.basis, flux / scale])[stars]
     # Exposures without a star here say nothing.
     design = design[:, design.any(axis=0)]
-    matrices, gradients = _own_equations(tuned, fit.added(), stars, workers)
+    matrices, gradients = _own_equations(
+        tuned, fit.blurs[fit.problem.exposure], stars, workers)
     change, errors = _solved(matrices, gradients, design)
+    before = np.zeros(3) if fit.fattening is None else fit.fattening
     value = scale * before + change
     chi2 = [value @ np.linalg.solve(error, value) for error in errors]
     wider = errors[int(np.argmin(chi2))]
-    return Fattening(value / scale, wider / scale**2, min(chi2), float(scale))
+    return Fattening(value / scale, wider / scale**2, min(chi2), scale)
+
+
+def _even_weights(fit, flux):
+    """
+    Return weights (n, s, s) that see the same part of each star.
+
+    The light of bright stars counts as noise out to larger radii than that
+    of faint ones, so that what is wrong with a PSF would widen them by
+    different amounts. All are weighted as a star of one flux is; what each
+    tells in all stays what it is.
+    """
+    problem = fit.problem
+    light = np.maximum(model_stamps(problem, fit.coefficients)
+                       - problem.sky[:, None, None], 0)
+    share = flux / np.maximum(fit.fluxes(), 1e-300)[:, None, None]
+    stamps = problem.stamps
+    variance = (stamps.base + stamps.slope * light * share
+                + (fit.accuracy * light * share) ** 2)
+    even = np.where(problem.weights > 0, 1 / variance, 0)
+    told, evenly = (np.sum(weights * light**2, axis=(1, 2))
+                    for weights in (problem.weights, even))
+    return even * (told / np.maximum(evenly, 1e-300))[:, None, None]
 
 
 def _own_equations(tuned, added, stars, workers):

@@ -203,7 +203,7 @@ def shape_covariance(covariance, unmodelled, basis):
 
 
 def psf_errors(at, covariance, unmodelled, degree, shape, integrated,
-               more=()):
+               more=(), misfit=0.0):
     """
     Return the errors of a field's PSF.
 
@@ -221,6 +221,8 @@ def psf_errors(at, covariance, unmodelled, degree, shape, integrated,
         Whether the mixtures are to be integrated over pixels.
     more : (Q,) sequence of float, optional
         The variances of the other numbers, the same everywhere.
+    misfit : float, optional
+        By what share of it the light in pixels is off.
 
     Returns
     -------
@@ -241,7 +243,7 @@ def psf_errors(at, covariance, unmodelled, degree, shape, integrated,
     found[:, :n_shapes, :n_shapes] = shape_covariance(covariance, unmodelled,
                                                       basis)
     return PSFErrors(grid, _directions(PSFErrors(grid, every), found,
-                                       integrated))
+                                       integrated), misfit)
 
 
 def slopes(of, size):

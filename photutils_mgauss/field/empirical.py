@@ -123,7 +123,8 @@ class EmpiricalPSF(ComparedByValue):
         oversampling = as_integer(oversampling, 'oversampling', minimum=1)
         field = fit_mixture_field(
             data, stars, error=error, mask=mask, n_components=n_components,
-            degree=degree, radius=radius, brighter_fatter=False,
+            degree=degree, radius=radius, normalise='stamps',
+            brighter_fatter=False,
             executor=executor)
         problem = _Lattice.of(field, oversampling)
         target, weights = _corrections(field, read_sample(

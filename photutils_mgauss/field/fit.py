@@ -4,6 +4,7 @@ The fit of a PSF field to the pixels of the stars of one or more images.
 Input is read and checked here, `photutils_mgauss.field.stages` does the
 fitting, and what it found becomes the public results.
 """
+import logging
 import warnings
 from dataclasses import replace
 
@@ -25,8 +26,10 @@ from photutils_mgauss.field.covariance import honest_covariance
 from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.growth import (
     FIRST_RADIUS,
+    light_inside,
     measure_wings,
     own_radius,
+    stars_of_exposures,
 )
 from photutils_mgauss.field.input import (
     allow_for_correlation,
@@ -34,6 +37,7 @@ from photutils_mgauss.field.input import (
     read_exposures,
     read_sample,
 )
+from photutils_mgauss.field.misfit import misfit
 from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.field.normal import Workers, model_stamps
 from photutils_mgauss.field.pixel import chosen_pixel, warn_of_phase
@@ -42,8 +46,11 @@ from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 
 __all__ = ['fit_mixture_field']
 
+_LOG = logging.getLogger('photutils_mgauss')
 # The degree of the polynomials with a PSF to start from.
 _TUNED_DEGREE = 1
+# How often the field follows what bright stars are wider by.
+_FATTER_STEPS = 2
 # The weight of the centre in widths of the core, and at most in radii of the
 # stamp. A narrower one follows aberrations in a way that no distortion of low
 # degree can describe, a wider one sees more noise.
@@ -53,7 +60,7 @@ _CENTRE_SIZE, _CENTRE_SHARE = 2.0, 0.36
 def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
                       degree=None, radius=None, local_bkg=False,
                       effective_gain=None, reject=True, regularization=None,
-                      start=None, centre='core', normalise='stamps',
+                      start=None, centre='core', normalise='auto',
                       pixel_integrated='auto', correlated_noise=True,
                       contexts=(), brighter_fatter='auto', executor=None):
     """
@@ -132,12 +139,14 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         other colours are moved as the positions in ``stars`` ask for. They
         must know nothing of colour then, as those of a catalogue. With
         ``start`` it stays where that of ``start`` is.
-    normalise : {'stamps', 'curve-of-growth'}, optional
-        What is all the flux of a star: that of the Gaussians, as the pixels
-        of the stamps continue them; or with what the stars show in rings
-        beyond their stamps, up to three radii, and as the power law of the
-        outer rings goes on. The light beyond is added as one wide Gaussian.
-        Not with ``start``.
+    normalise : {'auto', 'stamps', 'curve-of-growth'}, optional
+        What is all the flux of a star: 'stamps', that of the Gaussians, as
+        the pixels of the stamps continue them; or 'curve-of-growth', with
+        what the stars show in rings beyond their stamps, up to three radii,
+        and as the power law of the outer rings goes on. The light beyond is
+        added as one wide Gaussian. By default it is added if the rings of at
+        least five stars show it beyond doubt; a message of the level INFO
+        tells. With ``start`` it is that of ``start``.
     pixel_integrated : 'auto' or bool, optional
         Whether the Gaussians are those of the optics, integrated over each
         pixel, or those of the PSF in pixels, sampled at the middle of each.
@@ -223,13 +232,13 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
     if normalise == 'stamps':
         return field
     return _with_wings(field, sample, read_exposures(data, stars, error,
-                                                     mask))
+                                                     mask), normalise)
 
 
 def _check_words(centre, normalise, brighter_fatter, contexts):
     """Raise unless the options are those that there are."""
     as_choice(centre, 'centre', ('core', 'flux', 'catalogue'))
-    as_choice(normalise, 'normalise', ('stamps', 'curve-of-growth'))
+    as_choice(normalise, 'normalise', ('auto', 'stamps', 'curve-of-growth'))
     if centre == 'catalogue' and not contexts:
         msg = ("centre must be 'core' or 'flux' without contexts, got "
                "'catalogue'")
@@ -243,7 +252,7 @@ def _check_words(centre, normalise, brighter_fatter, contexts):
 
 def _check_known(normalise, contexts, brighter_fatter):
     """Raise if more is asked of a known PSF than its changes."""
-    if normalise != 'stamps':
+    if normalise == 'curve-of-growth':
         msg = ("normalise must be 'stamps' with start, whose wings are known "
                f'already, got {normalise!r}')
         raise ValueError(msg)
@@ -276,9 +285,10 @@ def _fatter(fit, wanted, workers, reject):
         raise ValueError(msg)
     if found is None or not (wanted is True or found.is_real):
         return None
-    fit.fattening = found.value
-    stages.polish(fit, workers, reject)
-    found = measure_fattening(fit, workers)
+    for _ in range(_FATTER_STEPS):
+        fit.fattening = found.value
+        stages.polish(fit, workers, reject)
+        found = measure_fattening(fit, workers)
     if wanted == 'auto':
         warnings.warn(
             'bright stars are wider than faint ones: the brightest by '
@@ -289,38 +299,37 @@ def _fatter(fit, wanted, workers, reject):
     return found
 
 
-def _with_wings(field, sample, exposures):
+def _with_wings(field, sample, exposures, normalise):
     """Return the field with the light beyond the stamps."""
-    table = field.stars[field.stars['used']]
-    flux = np.asarray(table['flux_fit'].value if hasattr(
-        table['flux_fit'], 'unit') else table['flux_fit'])
-    exposure = (table['exposure'] if 'exposure' in table.colnames
-                else np.zeros(len(table), int))
-    stars = np.column_stack([table['x_fit'], table['y_fit'], flux])
-    pixels = [one for one, _ in exposures]
-    wings = measure_wings(
-        pixels, sample.catalogues,
-        [stars[exposure == i] for i in range(len(pixels))],
-        field.enclosed_flux(*_middle(sample)) + _left(field, flux),
-        field.radius)
+    wings, why_not = measure_wings(
+        (pixels for pixels, _ in exposures), sample.catalogues,
+        stars_of_exposures(field, len(sample.reasons)),
+        light_inside(field, *_middle(sample)), field.radius)
+    if wings is None:
+        if normalise != 'auto':
+            msg = f"normalise='curve-of-growth' {why_not}"
+            raise ValueError(msg)
+        _LOG.info('the light beyond the stamps is not in the PSF: to measure '
+                  'it %s', why_not)
+        return field
+    if normalise == 'auto' and not wings.is_seen:
+        _LOG.info('stars show no light beyond their stamps, %.4f of the flux '
+                  'at most: the PSF is that of the stamps',
+                  wings.share + wings.error)
+        return replace(field, wing_error=float(np.hypot(wings.share,
+                                                        wings.error)))
     if wings.share == 0:
         warnings.warn(
             "normalise='curve-of-growth' found no light beyond the "
             f'stamps, {wings.error:.4f} of the flux at most; nothing was '
             'added', AstropyUserWarning, stacklevel=3)
+    _LOG.info('%.4f +- %.4f of the light of stars is beyond their stamps; it '
+              'is in the PSF as one wide Gaussian, and in fluxes',
+              wings.share, wings.error)
     new = field.stars.copy()
     new['flux_fit'] = new['flux_fit'] / (1 - wings.share)
     return replace(field, stars=new, wing_share=wings.share,
                    wing_stddev=wings.stddev, wing_error=wings.error)
-
-
-def _left(field, flux):
-    """Return the light the Gaussians leave in the stamps, over the flux."""
-    residual = field.residual_stars[np.asarray(field.stars['used'])]
-    # Deviant pixels count as what they would be without.
-    light = np.nanmean(residual, axis=(1, 2)) * np.count_nonzero(
-        np.isfinite(residual).any(axis=0))
-    return np.sum(flux * light) / np.sum(flux**2)
 
 
 def _free(problem, n_components, degree, top, workers, strength, reject):
@@ -330,8 +339,11 @@ def _free(problem, n_components, degree, top, workers, strength, reject):
         strength, workers)
     problem.basis = np.ascontiguousarray(
         problem.basis[:, :stages.n_terms(degree)])
-    return stages.run(problem, n_components, degree, workers,
-                      strength=strength, reject=reject), choice
+    fit = stages.run(problem, n_components, degree, workers,
+                     strength=strength, reject=reject)
+    if problem.pixel_integrated:
+        stages.allow_for_misfit(fit, misfit(fit), workers)
+    return fit, choice
 
 
 def _number(value, name, minimum):

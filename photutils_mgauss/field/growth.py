@@ -20,6 +20,7 @@ from astropy.stats import mad_std, sigma_clip
 from scipy.spatial import KDTree
 
 from photutils_mgauss.field.stamps import cut_stamps
+from photutils_mgauss.utils.star_columns import plain_values
 
 # The radius of the stamps if it is not given: so many full widths at half
 # maximum, but between these [pix].
@@ -29,10 +30,13 @@ _WIDTHS, _LARGEST = 4, 20
 _N_RINGS, _REACH = 10, 3.0
 # The slopes of power laws that are looked for: a flatter one has no end.
 _FLATTEST, _STEEPEST = 2.5, 6.0
-# What is expected of them: diffraction's, unless the stars say otherwise.
-_USUAL_SLOPE, _SLOPE_STDDEV = 3.0, 0.25
+# What is expected of them: diffraction's, within a Cauchy distribution of this
+# width, whose tails let stars say otherwise, as those of seeing do.
+_USUAL_SLOPE, _SLOPE_WIDTH = 3.0, 0.25
 _CLIP = 4.0
 _FEWEST_STARS = 5
+# Light that is seen beyond doubt [standard deviations].
+_SEEN = 5.0
 # The size of the Gaussian that carries the light, in radii of the stamps: wide
 # enough to change nothing inside.
 _SIZE = 2.0
@@ -49,11 +53,19 @@ class Wings:
         Its share of the PSF's flux, and the error of that.
     stddev : float
         Its size [pix].
+    significance : float
+        Of the light in the rings [standard deviations].
     """
 
     share: float
     error: float
     stddev: float
+    significance: float
+
+    @property
+    def is_seen(self):
+        """Whether the rings show light beyond doubt."""
+        return self.share > 0 and self.significance > _SEEN
 
 
 def own_radius(stamps):
@@ -81,25 +93,74 @@ def _half_radius(stamps):
     return last - 1 + (high - 0.5) / (high - low)
 
 
+def stars_of_exposures(field, n):
+    """Return x, y and flux (n, 3) of the stars used of each exposure."""
+    table = field.stars[field.stars['used']]
+    exposure = (np.asarray(table['exposure'])
+                if 'exposure' in table.colnames else np.zeros(len(table)))
+    stars = np.column_stack([table['x_fit'], table['y_fit'],
+                             plain_values(table['flux_fit'])])
+    return [stars[exposure == i] for i in range(n)]
+
+
+def light_inside(field, x, y):
+    """
+    Return the light inside the stamps, in fluxes of the stars, and its error.
+
+    It is that of the Gaussians at a place and what they leave of the stars;
+    the error is that of their mean, as they scatter.
+    """
+    left, error = left_over(field, field.radius)
+    return field.enclosed_flux(x, y) + left, error
+
+
+def left_over(field, radius):
+    """
+    Return the light that a field leaves inside a radius, over the flux.
+
+    Returns
+    -------
+    mean, error : float
+        Of the stars, the brighter the more.
+    """
+    used = np.asarray(field.stars['used'])
+    residual = field.residual_stars[used]
+    half = residual.shape[1] // 2
+    steps = np.arange(-half, half + 1)
+    inside = (np.hypot(steps, steps[:, None]) <= radius + 0.5) & np.isfinite(
+        residual).any(axis=0)
+    flux = plain_values(field.stars['flux_fit'])[used]
+    # Deviant pixels count as what they would be without.
+    light = np.nanmean(residual[:, inside], axis=1) * np.count_nonzero(inside)
+    share, weight = light / flux, flux**2 / np.sum(flux**2)
+    mean = weight @ share
+    n = max(flux.size - 1, 1)
+    error = np.sqrt(weight**2 @ (share - mean) ** 2 * flux.size / n)
+    return float(mean), float(error)
+
+
 def measure_wings(exposures, catalogues, stars, inside, radius):
     """
     Measure the light beyond the stamps of a field.
 
     Parameters
     ----------
-    exposures : list of PixelData
+    exposures : iterable of PixelData
     catalogues : list of Sources
         All sources of each exposure; pixels near others are left out.
     stars : list of (n, 3) `~numpy.ndarray`
         x, y and flux of the stars of each exposure that are used.
-    inside : float
-        The light inside the stamps, in fluxes of the stars.
+    inside : (float, float)
+        The light inside the stamps, in fluxes of the stars, and its error.
     radius : float
         Of the stamps [pix].
 
     Returns
     -------
-    Wings
+    Wings or None
+        None if too few stars have free pixels around.
+    why_not : str
+        What there would have to be.
     """
     edges = np.geomspace(radius + 0.5, _REACH * radius, _N_RINGS + 1)
     parts = [_ring_means(*one, edges) for one in zip(
@@ -108,15 +169,15 @@ def measure_wings(exposures, catalogues, stars, inside, radius):
     means, counts = (np.concatenate(one) for one in zip(*parts, strict=True))
     enough = np.count_nonzero(counts.sum(axis=1))
     if enough < _FEWEST_STARS:
-        msg = (f"normalise='curve-of-growth' needs at least {_FEWEST_STARS} "
-               f'stars with free pixels up to {_REACH:.0f} radii around, got '
-               f'{enough}')
-        raise ValueError(msg)
+        return None, (f'needs at least {_FEWEST_STARS} stars with free pixels '
+                      f'up to {_REACH:.0f} radii around, got {enough}')
     middle = np.sqrt(edges[1:] * edges[:-1]) / edges[0]
-    light, error = _light_beyond(flux, means, counts, middle)
+    light, error, significance = _light_beyond(flux, means, counts, middle)
     light, error = light * edges[0] ** 2, error * edges[0] ** 2
-    total = inside + max(light, 0)
-    return Wings(max(1 - 1 / total, 0.0), error / total**2, _SIZE * radius)
+    total = inside[0] + max(light, 0)
+    return Wings(float(max(1 - 1 / total, 0)),
+                 float(np.hypot(error, inside[1]) / total**2),
+                 _SIZE * radius, float(significance)), ''
 
 
 def _ring_means(pixels, catalogue, stars, edges):
@@ -150,7 +211,11 @@ def _ring_means(pixels, catalogue, stars, edges):
 
 
 def _light_beyond(flux, means, counts, middle):
-    """Return light beyond the first edge over its square, and the error."""
+    """
+    Return light beyond the first edge over its square, and the error.
+
+    The third number is the significance of the light in the rings.
+    """
     slopes = np.linspace(_FLATTEST, _STEEPEST, 36)
     kept = counts > 0
     for _ in range(4):
@@ -165,14 +230,15 @@ def _light_beyond(flux, means, counts, middle):
     # What is beside a star spoils several of its rings: they count as one.
     scatter *= np.sqrt(len(middle))
     cost = (chi2 / scatter**2
-            + ((slopes - _USUAL_SLOPE) / _SLOPE_STDDEV) ** 2)
+            + 2 * np.log1p(((slopes - _USUAL_SLOPE) / _SLOPE_WIDTH) ** 2))
     likely = np.exp(-0.5 * (cost - cost.min()))
     likely /= likely.sum()
     factor = 2 * np.pi / (slopes - 2)
     mean = likely @ (heights * factor)
     variance = likely @ ((heights * factor - mean) ** 2
                          + (errors * scatter * factor) ** 2)
-    return mean, np.sqrt(variance)
+    peak = np.argmax(likely)
+    return mean, np.sqrt(variance), heights[peak] / (errors[peak] * scatter)
 
 
 class _Fit(NamedTuple):

@@ -27,6 +27,7 @@ from photutils_mgauss.field.covariance import (
     slopes,
 )
 from photutils_mgauss.field.forms import convolved, mixture_arrays
+from photutils_mgauss.field.growth import left_over
 from photutils_mgauss.field.input import normalised
 from photutils_mgauss.files.storage import storable, table_columns
 from photutils_mgauss.psf.contexts import PSFContext, known_contexts
@@ -396,8 +397,10 @@ class MixtureField(Field):
         """
         Return the standard deviation of `aperture_correction`.
 
-        It holds the noise of the fitted shapes and, if the light beyond the
-        stamps was measured, ``wing_error``.
+        It holds the noise of the fitted shapes, what they do beyond the
+        polynomials, the light that the Gaussians leave of the stars inside
+        the radius and, if the light beyond the stamps was measured,
+        ``wing_error``.
 
         Parameters
         ----------
@@ -426,7 +429,17 @@ class MixtureField(Field):
         shapes = slope @ shape_covariance(
             self.covariance, self._unmodelled(), self._basis(x, y, kind)
             )[0] @ slope
-        return float(np.sqrt(shapes + (correction * self.wing_error) ** 2))
+        misfit = correction - self._corrected(radius, 1 / correction)
+        return float(np.sqrt(shapes + (correction * self.wing_error) ** 2
+                             + misfit**2))
+
+    def _corrected(self, radius, inside):
+        """Return the aperture correction that the stars' pixels ask for."""
+        if self.residual_stars is None:
+            return 1 / inside
+        left, total = (left_over(self, one)[0] for one in (radius,
+                                                           self.radius))
+        return (1 + total) / max(inside + left, 1e-3)
 
     def _unmodelled(self):
         if self.unmodelled is None:
@@ -455,7 +468,8 @@ class MixtureField(Field):
             lambda x, y, change: (self._basis(x, y, kind), *self._mixtures(
                 x, y, kind, change)[:3]),
             self.covariance, self._unmodelled(), self.degree, self.shape,
-            self.pixel_integrated, self._blur_variance(exposure))
+            self.pixel_integrated, self._blur_variance(exposure),
+            self.accuracy if self.pixel_integrated else 0.0)
 
     def _blur_variance(self, exposure):
         """Return the variances (3,) of what an exposure adds, if any."""
@@ -526,7 +540,7 @@ class MixtureField(Field):
                 () if self.contexts is None else self.contexts.iterrows(
                     'name', 'mean', 'low', 'high')):
             if name not in contexts:
-                yield name, np.concatenate([
+                yield str(name), np.concatenate([
                     np.linspace(low, mean, _LAYERS, endpoint=False), [mean],
                     np.linspace(high, mean, _LAYERS, endpoint=False)[::-1]
                 ]), mean

@@ -406,52 +406,39 @@ def _stage(state, index, degree, workers, reject, *, adapt=False):
 
 def _fit_blurs(state, workers):
     """
-    Fit what exposures, and fluxes, add to the covariances, the field given.
+    Fit what each exposure adds to the covariances, all else given.
 
-    The mean of the exposures belongs to the field.
+    Their mean belongs to the field.
     """
     problem, n = state.problem, len(state.blurs)
-    if n < 2 and state.fattening is None:
+    if n < 2:
+        if state.fattening is not None:
+            problem.local = state.added()
         return
-    tuned, scale = added_shapes(state, with_flux=state.fattening is not None)
-    start = np.zeros((tuned.basis.shape[1], 3))
-    start[:n] = state.blurs
-    if state.fattening is not None:
-        start[n] = state.fattening * scale
+    tuned = added_shapes(state)
     width = np.exp(-tuned.local[:, 0, [3, 5]].mean())
-    prior = Prior(np.zeros(start.shape), np.full(start.shape, width**-4.0))
-    found, there = optimise(tuned, start, prior, workers, max_steps=10,
+    prior = Prior(np.zeros((n, 3)), np.full((n, 3), width**-4.0))
+    blurs, found = optimise(tuned, state.blurs, prior, workers, max_steps=10,
                             tolerance=0.03)
-    state.blurs = found[:n] - found[:n].mean(axis=0)
-    if n > 1:
-        covariance = np.linalg.inv(there.matrix + np.diag(to_vector(
-            prior.precision)))
-        blurs = np.tile(np.arange(len(start)) < n, 3)
-        state.blur_covariance = covariance[np.ix_(blurs, blurs)]
-    if state.fattening is not None:
-        state.fattening = found[n] / scale
+    state.blurs = blurs - blurs.mean(axis=0)
+    state.blur_covariance = np.linalg.inv(found.matrix + np.diag(
+        to_vector(prior.precision)))
     problem.sources, problem.sky = tuned.sources, tuned.sky
     problem.local = state.added()
 
 
-def added_shapes(state, *, with_flux):
+def added_shapes(state):
     """
-    Return the problem of what is added to the covariances of stars.
+    Return the problem of what exposures add to the covariances of stars.
 
-    Its terms are the exposures and, if asked for, the flux in units of the
-    largest, which is returned, too. With one exposure its term leaves the
-    mean size of stars to the field.
+    What fluxes add is part of the shapes that are known.
     """
     problem, n = state.problem, len(state.blurs)
-    basis = np.eye(n)[problem.exposure]
-    flux = state.fluxes()
-    scale = max(flux.max(), 1e-300)
-    if with_flux:
-        basis = np.column_stack([basis, flux / scale])
-    bare = replace(problem, local=np.zeros_like(problem.local))
-    return replace(problem, form=TunedShapes(), basis=basis,
-                   local=TunedShapes.local(bare.shapes(state.coefficients),
-                                           1.0)), scale
+    known = replace(problem, local=state.added()
+                    - state.blurs[problem.exposure])
+    return replace(
+        problem, form=TunedShapes(), basis=np.eye(n)[problem.exposure],
+        local=TunedShapes.local(known.shapes(state.coefficients), 1.0))
 
 
 def _settle_all(state, workers):
@@ -491,6 +478,14 @@ def polish(state, workers, reject):
     for _ in range(_ADAPTATIONS if len(state.coefficients) > 1 else 0):
         _adapt(state, workers, reject)
     return state
+
+
+def allow_for_misfit(state, misfit, workers):
+    """Take the light in pixels to be off by this share of it, in place."""
+    if misfit != state.accuracy:
+        state.accuracy = misfit
+        weigh(state, reject=False, share=None)
+        advance(state, workers, tolerance=0.01, max_steps=10)
 
 
 def _adapt(state, workers, reject):

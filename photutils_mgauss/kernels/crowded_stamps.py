@@ -8,7 +8,12 @@ from photutils_mgauss.kernels.gaussian import fast_exp
 from photutils_mgauss.kernels.image import ERRORS, add_sampled, add_star
 from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import clear
-from photutils_mgauss.kernels.tile import LANES, add_gaussian
+from photutils_mgauss.kernels.tile import (
+    LANES,
+    SCRATCH,
+    add_gaussian,
+    faintest,
+)
 
 
 class Sources(NamedTuple):
@@ -59,20 +64,21 @@ def star_stamps(chosen, sources, stamps, gaussians):
     widest = 0
     for i in chosen:
         widest = max(widest, width[i])
-    walk = np.empty(4 * LANES)
+    walk = np.zeros(SCRATCH)
     tile = np.empty(3 * LANES * widest)
     for i in chosen:
         w = width[i]
+        faint = faintest(rows[i, :count[i]]) if integrated else 0.0
         for first in range(0, w, LANES):
             height = min(LANES, w - first)
-            clear(walk, walk.size)
+            clear(walk, 4 * LANES)
             clear(tile, 3 * LANES * w)
             for k in range(count[i]):
                 a, mx, my, p, s, q = rows[i, k]
                 add_gaussian(a, left[i] - x[i] - mx,
                              bottom[i] + first - y[i] - my, p, s, q,
-                             strides[i, k], 0.0, 0.0, integrated, height, w,
-                             walk, tile)
+                             strides[i, k], 0.0, 0.0, integrated, faint,
+                             height, w, walk, tile)
             for j in range(height):
                 to = offset[i] + (first + j) * w
                 for k in range(w):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from photutils_mgauss.kernels.jit import inner, kernel, sums
-from photutils_mgauss.kernels.tile import LANES, fill_derivatives
+from photutils_mgauss.kernels.tile import LANES, SCRATCH, fill_derivatives
 
 # A group of n stars is seen on the pixels of its n boxes, (first row, first
 # column, height, width) each; a single star is a group of one. Where boxes
@@ -87,7 +87,7 @@ class Tiling(NamedTuple):
     @classmethod
     def empty(cls, width):
         """Return what derivatives in boxes of at most this width need."""
-        return cls(np.empty(4 * LANES), np.empty(3 * LANES * width),
+        return cls(np.zeros(SCRATCH), np.empty(3 * LANES * width),
                    np.empty(4, np.int64), np.empty((3, 4)))
 
 

@@ -1,5 +1,5 @@
 """The PSF of a star and its derivatives on a tile of pixels."""
-from math import exp
+from math import exp, log, sqrt
 
 import numpy as np
 
@@ -12,6 +12,14 @@ from photutils_mgauss.kernels.grid import blend_weights
 from photutils_mgauss.kernels.jit import inner, loop
 from photutils_mgauss.kernels.linear import clear
 from photutils_mgauss.kernels.pixels import N_NODES, add_integrals
+from photutils_mgauss.kernels.series import (
+    LANES,
+    LEFT_OUT,
+    SERIES,
+    add_series,
+    pixel_peak,
+    series_length,
+)
 
 # The PSF of a star and its derivatives by position are summed in a tile, one
 # flat array: for each pixel column LANES values of the PSF, as many of its
@@ -19,7 +27,10 @@ from photutils_mgauss.kernels.pixels import N_NODES, add_integrals
 # memory and fixed offsets lie between the parts, so that the compiler works on
 # several rows at once; their number is a constant, for a remainder of a few
 # rows one by one would take longer than all the others.
-LANES = 16
+
+# Numbers of which walks over a tile, and series of products, make use.
+_WALK = 4 * LANES
+SCRATCH = _WALK + SERIES
 
 # The smallest share of a Gaussian in a blend, so that the slope of the share
 # can be divided by it; lost in rounding where it stands for zero.
@@ -102,25 +113,55 @@ def _add_points(a, dx, dy, p, s, q, by_x, by_y, height, width, tile):
 
 
 @inner
-def add_gaussian(a, dx, dy, p, s, q, stride, by_x, by_y, integrated, height,
-                 width, walk, tile):
+def _add_pixels(a, dx, dy, p, s, q, by_x, by_y, faint, height, width, work,
+                tile):
+    """Add a Gaussian that is integrated over pixels to a tile."""
+    # Next to a node the share of another is nothing, but its slope is not.
+    most = pixel_peak(a, p, q) * max(1.0, abs(by_x), abs(by_y))
+    left_out = log(faint / most)
+    if not left_out < 0:
+        return
+    ratio, terms = series_length(p, s, q, left_out)
+    if terms:
+        add_series(a, dx, dy, p, s, q, ratio, terms, sqrt(-2 * left_out),
+                   by_x, by_y, height, width, work[_WALK:], tile)
+        return
+    nodes = work[:2 * N_NODES].reshape((2, N_NODES))
+    for j in range(height):
+        add_integrals(a, dx, dy + j, p, s, q, by_x, by_y, nodes, width,
+                      3 * LANES, tile[j:])
+
+
+@inner
+def faintest(rows):
+    """Return what may be left out of each Gaussian of rows (K, 6)."""
+    peak = 0.0
+    for k in range(rows.shape[0]):
+        a, _, _, p, _, q = rows[k]
+        if a != 0:
+            peak += pixel_peak(a, p, q)
+    return LEFT_OUT * peak
+
+
+@inner
+def add_gaussian(a, dx, dy, p, s, q, stride, by_x, by_y, integrated, faint,
+                 height, width, walk, tile):
     """
     Add a Gaussian, its first pixel at (dx, dy) from the peak, to a tile.
 
     a includes its share in the blend, whose relative slopes are by_x and
-    by_y.
+    by_y. What is less than faint may be left out of an integrated Gaussian.
+    walk (SCRATCH,) begins with zeros.
     """
+    if integrated:
+        _add_pixels(a, dx, dy, p, s, q, by_x, by_y, faint, height, width,
+                    walk, tile)
+        return
     left = min(dx - s * dy, dx - s * (dy + height - 1))
     # A walk that begins too far out begins at zero.
     steep = (p > 50 or q > 50 or p * abs(s) * height > 200
              or (left < 0 and p * left * left > 600))
-    if integrated:
-        # There is no walk, so its memory is free.
-        nodes = walk[:2 * N_NODES].reshape((2, N_NODES))
-        for j in range(height):
-            add_integrals(a, dx, dy + j, p, s, q, by_x, by_y, nodes, width,
-                          3 * LANES, tile[j:])
-    elif steep:
+    if steep:
         _add_points(a, dx, dy, p, s, q, by_x, by_y, height, width, tile)
     elif _walk_starts(a, dx - s * dy, dy, p, s, q, stride, by_x, by_y, height,
                       walk):
@@ -132,8 +173,12 @@ def _fill_tile(x_0, y_0, row, column, height, width, psf, tiling):
     """Put the PSF and its derivatives in up to LANES rows into the tile."""
     nodes, strides, _, _, integrated = psf
     walk, tile, index, weights = tiling
-    clear(walk, walk.size)
+    clear(walk, _WALK)
     clear(tile, 3 * LANES * width)
+    faint = 0.0
+    if integrated:
+        for corner in range(4):
+            faint += weights[0, corner] * faintest(nodes[index[corner]])
     for corner in range(4):
         w, wx, wy = weights[0, corner], weights[1, corner], weights[2, corner]
         if w == 0 and wx == 0 and wy == 0:
@@ -144,7 +189,7 @@ def _fill_tile(x_0, y_0, row, column, height, width, psf, tiling):
             if a != 0:
                 add_gaussian(w * a, column - x_0 - mx, row - y_0 - my, p, s,
                              q, strides[index[corner], k], wx / w, wy / w,
-                             integrated, height, width, walk, tile)
+                             integrated, faint, height, width, walk, tile)
 
 
 @inner

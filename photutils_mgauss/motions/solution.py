@@ -16,6 +16,7 @@ from photutils_mgauss.motions.loop import (
     fitted_terms,
     measured_alone,
 )
+from photutils_mgauss.motions.membership import mean_motion
 from photutils_mgauss.motions.propagation import (
     propagated,
     star_covariance,
@@ -23,6 +24,8 @@ from photutils_mgauss.motions.propagation import (
 from photutils_mgauss.motions.tables import (
     FLAGS,
     alignment_table,
+    mean_table,
+    membership_table,
     residual_table,
     star_table,
     validation_table,
@@ -226,12 +229,77 @@ class MotionSolution:
         ValueError
             If a star is unknown, or motions are relative.
         """
-        if self._fit.setup.relative:
-            msg = ('references must be given for covariances between '
-                   'stars, got relative motions')
-            raise ValueError(msg)
+        self._check_absolute('for covariances between stars')
         stars = _numbers_of(np.atleast_1d(ids), self.stars['id'])
         return star_covariance(self._fit, stars, self._year)
+
+    def mean(self, ids=None):
+        """
+        Return the mean motion of some stars, as of the members of a cluster.
+
+        Parameters
+        ----------
+        ids : (k,) array_like, optional
+            Their identifiers; by default all stars but the references.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            One row: ``pmra``, ``pmdec``, their errors and correlation, with
+            the error of the frames, which all stars have in common;
+            ``dispersion``, what the motions scatter beyond their errors, and
+            ``n``, the number of stars with motions.
+
+        Raises
+        ------
+        ValueError
+            If a star is unknown or none has a motion, or motions are
+            relative: the mean of all is zero then by choice.
+        """
+        self._check_absolute('for the mean of motions')
+        stars = (np.flatnonzero(np.asarray(self.stars['reference']) == '')
+                 if ids is None
+                 else _numbers_of(np.atleast_1d(ids), self.stars['id']))
+        stars = stars[np.isfinite(self.stars['pmra'][stars].value)]
+        if not len(stars):
+            msg = 'ids must hold a star with a motion, got none'
+            raise ValueError(msg)
+        return mean_table(len(stars), self.stars['pmra'].unit, *mean_motion(
+            self._fit, stars, propagated(self._fit, self._year)))
+
+    def membership(self, *, n_field=1):
+        """
+        Return the probability of each star to move with a cluster.
+
+        A mixture of a cluster and the field is fitted to the motions, each
+        with its own covariance. References take no part.
+
+        Parameters
+        ----------
+        n_field : int, optional
+            The number of Gaussians of the field.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            ``id`` and ``membership``, NaN for stars without a motion, in the
+            order of ``stars``. Its ``meta`` has the part of the stars that
+            are members, their mean motion and dispersion.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If ``n_field`` is not a positive integer, or too few stars have
+            motions.
+        """
+        n_field = as_integer(n_field, 'n_field', minimum=1)
+        return membership_table(self.stars, n_field)
+
+    def _check_absolute(self, purpose):
+        if self._fit.setup.relative:
+            msg = (f'references must be given {purpose}, got relative '
+                   'motions')
+            raise ValueError(msg)
 
     def validation(self):
         """

@@ -6,6 +6,7 @@ from astropy.table import MaskedColumn, QTable
 from photutils_mgauss.motions.baseline import period
 from photutils_mgauss.motions.joint import solve_all
 from photutils_mgauss.motions.loop import measured
+from photutils_mgauss.motions.membership import fit_groups
 from photutils_mgauss.motions.propagation import FROM_OURS
 from photutils_mgauss.motions.stacked import invert_2x2
 from photutils_mgauss.sky.tangent_plane import directions
@@ -37,6 +38,17 @@ FLAGS = {
     262144: ('wandered: the fit to the pixels went farther from the place '
              'given than half a stamp'),
 }
+UCDS = {
+    'id': 'meta.id;meta.main', 'ra': 'pos.eq.ra;meta.main',
+    'dec': 'pos.eq.dec;meta.main', 'parallax': 'pos.parallax.trig',
+    'pmra': 'pos.pm;pos.eq.ra', 'pmdec': 'pos.pm;pos.eq.dec',
+    'x': 'pos.cartesian.x', 'y': 'pos.cartesian.y',
+    'ref_epoch': 'meta.ref;time.epoch', 'n_obs': 'meta.number;obs',
+    'n_good_obs': 'meta.number;obs', 'chi2': 'stat.fit.chi2',
+    'dof': 'stat.fit.dof', 'uwe': 'stat.fit.goodness',
+    'flux': 'phot.flux', 'flags': 'meta.code.qual',
+    'radial_velocity': 'spect.dopplerVeloc', 'source_id': 'meta.id',
+    'visibility_periods_used': 'meta.number;obs'}
 GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
 STRONG = 0.3
 
@@ -123,6 +135,7 @@ def star_table(fit, ref_year, parameters):
     table['reference'] = _reference_kinds(fit)
     _add_references(table, sightings)
     table['flags'] = flags
+    _add_ucds(table)
     table.meta['TIMESYS'] = 'TDB'
     return table
 
@@ -298,6 +311,56 @@ def alignment_table(fit, wcs_residuals):
                       xcentre=transform.centre[0],
                       ycentre=transform.centre[1], scale=transform.scale)
     return table
+
+
+def mean_table(n, unit, mean, covariance, dispersion):
+    """Return the one row of a mean motion."""
+    error = np.sqrt(np.diag(covariance))
+    return QTable({
+        'pmra': [mean[0]] * unit, 'pmra_error': [error[0]] * unit,
+        'pmdec': [mean[1]] * unit, 'pmdec_error': [error[1]] * unit,
+        'pmra_pmdec_corr': [covariance[0, 1] / error.prod()],
+        'dispersion': [dispersion] * unit, 'n': [n]})
+
+
+def membership_table(stars, n_field):
+    """Return the probabilities of stars to belong to a cluster."""
+    motion = np.stack([stars[name].value for name in ('pmra', 'pmdec')], 1)
+    error = np.stack([stars[f'{name}_error'].value
+                      for name in ('pmra', 'pmdec')], 1)
+    covariance = error[:, :, None] * error[:, None, :]
+    covariance[:, 0, 1] *= stars['pmra_pmdec_corr']
+    covariance[:, 1, 0] *= stars['pmra_pmdec_corr']
+    use = (np.isfinite(covariance).all(axis=(1, 2))
+           & np.isfinite(motion).all(axis=1))
+    free = use & (np.asarray(np.ma.filled(stars['reference'], '')) == '')
+    groups = fit_groups(motion[free], covariance[free], n_field)
+    terms = groups.densities(motion[use], covariance[use])
+    probability = np.full(len(stars), np.nan)
+    probability[use] = np.exp(terms[0] - np.logaddexp.reduce(terms, axis=0))
+    table = QTable({'id': stars['id'], 'membership': probability})
+    table['membership'].info.meta = {'ucd': 'stat.probability'}
+    sigma = np.sqrt(np.trace(groups.covariance[0]) / 2)
+    table.meta.update(
+        unit=str(stars['pmra'].unit), fraction=float(groups.fraction[0]),
+        pmra=float(groups.mean[0, 0]), pmdec=float(groups.mean[0, 1]),
+        dispersion=float(sigma))
+    return table
+
+
+def _add_ucds(table):
+    """Say what columns are as the Virtual Observatory does."""
+    for name in table.colnames:
+        stem = name.removesuffix('_error')
+        if stem in UCDS:
+            ucd = UCDS[stem]
+        elif name.endswith('_corr'):
+            ucd = 'stat.correlation'
+        else:
+            continue
+        if stem != name:
+            ucd = f'stat.error;{ucd.removesuffix(";meta.main")}'
+        table[name].info.meta = {'ucd': ucd}
 
 
 def _add_scales(table, fit):

@@ -130,7 +130,8 @@ def cut_boxes(x, y, fit_shape, data_shape):
     ----------
     x, y : (n,) `~numpy.ndarray`
         Finite positions.
-    fit_shape, data_shape : (ny, nx) tuple
+    fit_shape : (ny, nx) tuple or (n, 2) `~numpy.ndarray`
+    data_shape : (ny, nx) tuple
 
     Returns
     -------
@@ -139,6 +140,7 @@ def cut_boxes(x, y, fit_shape, data_shape):
         where a box does not overlap the image.
     """
     boxes = np.empty((x.size, 4), np.int64)
+    fit_shape = np.transpose(fit_shape)
     for axis, position in enumerate((y, x)):
         # As astropy.nddata.overlap_slices rounds.
         start = np.ceil(position - fit_shape[axis] / 2)

@@ -8,7 +8,7 @@ from photutils_mgauss.psf.star_errors import StarPixels, exact, known_errors
 from photutils_mgauss.utils.parallel import Threads
 
 
-def with_all_errors(result, image, model, fit_shape, *, psf_errors=True,
+def with_all_errors(result, image, model, *, psf_errors=True,
                     correlation=None, fit_sky=False, executor=None,
                     n_threads=None):
     """
@@ -19,7 +19,6 @@ def with_all_errors(result, image, model, fit_shape, *, psf_errors=True,
     result : FitResult
     image : `~photutils_mgauss.kernels.Image`
     model : GriddedMixturePSF or MultiGaussianPSFModel
-    fit_shape : (int, int)
     psf_errors : bool, optional
         Whether to add what the PSF may be off, where that is known.
     correlation : NoiseCorrelation, optional
@@ -37,15 +36,21 @@ def with_all_errors(result, image, model, fit_shape, *, psf_errors=True,
         return result, None
     rows = np.flatnonzero(np.isfinite(result.values).all(axis=1)
                           & result.has_covariance)
-    pixels = StarPixels(
-        image, exact(model) if errors is None else errors,
-        result.values[rows], fit_shape, free=result.free, fit_sky=fit_sky,
-        integrated=model.pixel_integrated)
     pool = (nullcontext(executor) if n_threads is None
             or executor is not None else Threads(n_threads))
+    shapes, which = np.unique(result.shapes[rows], axis=0,
+                              return_inverse=True)
+    psf, growth = np.empty((2, rows.size, 3, 3))
     with pool as executor:
-        psf, growth = pixels.covariances(
-            executor, None if correlation is None else correlation.matrix)
+        for k, shape in enumerate(shapes):
+            some = which.ravel() == k
+            pixels = StarPixels(
+                image, exact(model) if errors is None else errors,
+                result.values[rows[some]], shape, free=result.free,
+                fit_sky=fit_sky, integrated=model.pixel_integrated)
+            psf[some], growth[some] = pixels.covariances(
+                executor, None if correlation is None
+                else correlation.matrix)
     free = np.ix_(np.arange(rows.size), *[np.flatnonzero(result.free)] * 2)
     grown = growth[free] @ result.covariances[rows][free] @ growth[
         free].transpose(0, 2, 1)

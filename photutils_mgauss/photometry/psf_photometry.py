@@ -28,10 +28,16 @@ from photutils_mgauss.photometry.contexts import (
 )
 from photutils_mgauss.photometry.errors import with_all_errors
 from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
+from photutils_mgauss.photometry.saturated import (
+    SaturatedStars,
+    flag,
+    with_misfit,
+)
 from photutils_mgauss.utils import compat
 from photutils_mgauss.utils.correlated_noise import noise_correlation
 from photutils_mgauss.utils.image import read_pixels, with_unit
 from photutils_mgauss.utils.per_thread import PerThread, keep
+from photutils_mgauss.utils.saturation import as_saturation
 from photutils_mgauss.utils.star_columns import plain_values
 from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 
@@ -94,6 +100,15 @@ class MixturePSFPhotometry(PSFPhotometry):
         correlated, as in resampled images, and to enlarge the errors for
         that. What was found is in ``meta['noise_correlation']`` of the
         table, and a warning tells it. Only used with ``error``.
+    saturation : float or `~astropy.units.Quantity`, optional
+        The level from which pixels are saturated, in the unit of the data
+        and, as these, without the background; infinity if masks and NaN
+        tell. If given, such pixels are left out, with the trails along
+        rows and columns that their charge has run into and a pixel around
+        them; stars behind them are fitted to their wings, from where these
+        say they are, in as many pixels as that takes, and have bit 65536 in
+        ``flags``. Their errors grow by the root of ``reduced_chi2`` where it
+        is above one.
     aperture_radius_correction : float, optional
         If given, adds the column ``aperture_correction``: what to multiply a
         flux measured within this radius [pix] by, the inverse of the PSF's
@@ -148,7 +163,7 @@ class MixturePSFPhotometry(PSFPhotometry):
                  n_threads=None, fit_sky=False, effective_gain=None,
                  variance='model', xy_cov=False, psf_errors=True,
                  correlated_noise=True,
-                 aperture_radius_correction=None, **kwargs):
+                 aperture_radius_correction=None, saturation=None, **kwargs):
         fitter = MixtureFitter() if fitter is None else fitter
         if n_threads is not None and compat.HAS_THREADS:
             kwargs['n_threads'] = n_threads
@@ -170,6 +185,8 @@ class MixturePSFPhotometry(PSFPhotometry):
             else as_real(effective_gain, 'effective_gain', above=0))
         self.variance = as_choice(variance, 'variance', ('model', 'data'))
         self.xy_cov = bool(xy_cov)
+        self.saturation = as_saturation(saturation)
+        self._saturated = SaturatedStars()
         self.aperture_radius_correction = (
             None if aperture_radius_correction is None
             else as_real(aperture_radius_correction,
@@ -216,6 +233,7 @@ class MixturePSFPhotometry(PSFPhotometry):
 
     def _measure(self, pixels, init_params):
         """Do what a call does; changes this object."""
+        pixels = self._without_saturated(pixels)
         data, error = (array if array is None
                        else with_unit(array, pixels.unit)
                        for array in (pixels.data, pixels.error))
@@ -232,9 +250,11 @@ class MixturePSFPhotometry(PSFPhotometry):
         self.init_params = init_params
         image = self._make_image(data, mask, error)
         result, group_size = self._fit_contexts(image, init_params)
+        result = with_misfit(result, error is not None
+                             or self.effective_gain is not None)
         correlation = self._correlation(image, result)
         result, psf_part = with_all_errors(
-            result, image, self.psf_model, self.fit_shape,
+            result, image, self.psf_model,
             psf_errors=self.psf_errors, correlation=correlation,
             fit_sky=self.fit_sky, executor=self.executor,
             n_threads=self._n_threads)
@@ -244,6 +264,14 @@ class MixturePSFPhotometry(PSFPhotometry):
             '' if correlation is None else str(correlation))
         self._warn_of_failures(result)
         return self.results
+
+    def _without_saturated(self, pixels):
+        """Mask saturated pixels, and see what stars are behind them."""
+        pixels, self._saturated = SaturatedStars.of(
+            pixels, self.saturation,
+            self.psf_model if self._can_fit else None)
+        self._data_processor.finder = self._saturated.finder(self.finder)
+        return pixels
 
     def _fit_contexts(self, image, init_params):
         """Fit the stars, each with the PSF of its own colour or flux."""
@@ -381,7 +409,8 @@ class MixturePSFPhotometry(PSFPhotometry):
         has_error = has_error or self.effective_gain is not None
         quality = _table.fit_quality(result, np.count_nonzero(self._free),
                                      has_error)
-        flags = _table.define_flags(result, self.fit_shape, data_shape)
+        flags = flag(_table.define_flags(result, self.fit_shape, data_shape),
+                     result.saturated)
         columns = _table.make_columns(result, quality, flags, self.data_unit)
         columns |= self._extra_columns(result)
         columns |= _table.psf_columns(psf_part, self.data_unit)
@@ -420,7 +449,15 @@ class _Start:
              for name in ('flux', 'x', 'y')])
         self.local_bkg = plain_values(init_params['local_bkg'])
         self.free = photometry._free
+        # Saturated stars start from their wings, whatever they are given.
+        stars = photometry._saturated
+        self.shapes, self.saturated = stars.widths(
+            *self.initial[:, 1:].T, photometry.fit_shape)
         self._set_bounds(photometry)
+        stars.starts(self.saturated, self.initial, self.free)
+        rows = self.saturated[self.saturated >= 0]
+        self.initial[rows] = np.clip(self.initial[rows], self.lower[rows],
+                                     self.upper[rows])
         self._set_boxes(photometry.fit_shape, image)
 
     def _set_bounds(self, photometry):
@@ -458,8 +495,8 @@ class _Start:
         finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(flux)
         self.reasons[finite & ~near] = _table.NO_OVERLAP
         usable = finite & near
-        self.boxes[usable] = engine.cut_boxes(x[usable], y[usable],
-                                              fit_shape, data_shape)
+        self.boxes[usable] = engine.cut_boxes(
+            x[usable], y[usable], self.shapes[usable], data_shape)
         area = self.boxes[:, 2] * self.boxes[:, 3]
         self.reasons[usable & (area == 0)] = _table.NO_OVERLAP
         self.n_pixels = engine.count_pixels(image, self.boxes)
@@ -486,7 +523,7 @@ class _Start:
             self.initial, self.lower, self.upper, self.local_bkg,
             self.n_pixels, self.reasons, self.valid, self.free,
             self.flagged_bounds, full.values, full.covariances, full.sky,
-            full.sums, full.outcome)
+            full.sums, full.outcome, self.saturated, self.shapes)
 
 
 def _check_errors(fits, stars):

@@ -51,6 +51,10 @@ class FitResult:
         Whose bounds give rise to a flag.
     values, covariances, sky, sums, outcome : `~numpy.ndarray`
         As in `Fits`; NaN for stars that were not fitted.
+    saturated : (m,) `~numpy.ndarray` of int
+        The rows of saturated stars, -1 for those that are not listed.
+    shapes : (n, 2) `~numpy.ndarray` of int
+        How many pixels (ny, nx) of each star are fitted.
     """
 
     initial: np.ndarray
@@ -67,6 +71,8 @@ class FitResult:
     sky: np.ndarray
     sums: np.ndarray
     outcome: np.ndarray
+    saturated: np.ndarray
+    shapes: np.ndarray
 
     @property
     def converged(self):

@@ -31,6 +31,7 @@ from photutils_mgauss.plotting.motions import (
     plot_cutouts,
     plot_errors_by_epochs,
     plot_motion_errors,
+    plot_motions_by_magnitude,
     plot_proper_motions,
     plot_residual_vectors,
 )
@@ -61,6 +62,7 @@ __all__ = [
     'plot_mixture',
     'plot_model_graph',
     'plot_motion_errors',
+    'plot_motions_by_magnitude',
     'plot_node_map',
     'plot_posterior',
     'plot_profile',

@@ -7,6 +7,7 @@ __all__ = [
     'plot_cutouts',
     'plot_errors_by_epochs',
     'plot_motion_errors',
+    'plot_motions_by_magnitude',
     'plot_proper_motions',
     'plot_residual_vectors',
 ]
@@ -71,7 +72,7 @@ def _field_coordinates(rows):
             3600 * (dec - middle))
 
 
-def plot_proper_motions(stars, *, ax=None):
+def plot_proper_motions(stars, *, membership=None, ax=None):
     """
     Plot the proper-motion diagram of a table of stars.
 
@@ -79,6 +80,9 @@ def plot_proper_motions(stars, *, ax=None):
     ----------
     stars : `~astropy.table.QTable`
         As `~photutils_mgauss.MotionSolution.stars`.
+    membership : (n,) array_like, optional
+        The probability of each to be a member of a cluster, which gives
+        stars their colour.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw; None is pyplot's current Axes.
 
@@ -89,6 +93,11 @@ def plot_proper_motions(stars, *, ax=None):
     """
     ax = current_axes(ax)
     reference = _is_reference(stars)
+    if membership is not None:
+        free = ~reference & np.isfinite(np.asarray(membership))
+        ax.scatter(stars['pmra'][free].value, stars['pmdec'][free].value, 9,
+                   np.asarray(membership)[free], cmap='viridis', vmin=0,
+                   vmax=1, zorder=3)
     for which, colour, label in ((~reference, BLUE, 'stars'),
                                  (reference, ORANGE, 'references')):
         some = stars[which]
@@ -109,7 +118,37 @@ def _is_reference(stars):
     return np.ma.filled(stars['reference'], '') != ''
 
 
-def plot_motion_errors(stars, magnitude, *, ax=None):
+def plot_motions_by_magnitude(stars, magnitude, *, ax=None):
+    """
+    Plot both proper motions against magnitude.
+
+    A trend is a systematic error; see ``terms`` of
+    `~photutils_mgauss.ProperMotionFitter`.
+
+    Parameters
+    ----------
+    stars : `~astropy.table.QTable`
+        As for `plot_proper_motions`.
+    magnitude : (n,) array_like
+        A magnitude for each.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+    """
+    ax = current_axes(ax)
+    for name, colour in (('pmra', ORANGE), ('pmdec', BLUE)):
+        ax.errorbar(np.asarray(magnitude), stars[name].value,
+                    stars[f'{name}_error'].value, fmt='.', color=colour,
+                    alpha=0.5, elinewidth=0.5, markersize=3, label=name)
+    ax.set(xlabel='magnitude [mag]', ylabel=f'motion [{stars["pmra"].unit}]')
+    ax.legend()
+    return ax
+
+
+def plot_motion_errors(stars, magnitude, *, bound=None, ax=None):
     """
     Plot errors of motions against magnitude (as Fig. 12 of Nie et al.).
 
@@ -119,6 +158,8 @@ def plot_motion_errors(stars, magnitude, *, ax=None):
         As for `plot_proper_motions`.
     magnitude : (n,) array_like
         A magnitude for each.
+    bound : (n,) array_like, optional
+        The smallest error that is possible, in the same unit.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw; None is pyplot's current Axes.
 
@@ -134,6 +175,10 @@ def plot_motion_errors(stars, magnitude, *, ax=None):
         ax.plot(np.asarray(magnitude)[free],
                 stars[f'{name}_error'][free].value, '.', color=colour,
                 markersize=3, label=name)
+    if bound is not None:
+        order = np.argsort(np.asarray(magnitude)[free])
+        ax.plot(np.asarray(magnitude)[free][order],
+                np.asarray(bound)[free][order], color='black', label='bound')
     ax.set(yscale='log', xlabel='magnitude [mag]',
            ylabel=f'error [{stars["pmra"].unit}]')
     ax.legend()

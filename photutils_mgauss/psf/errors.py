@@ -14,7 +14,9 @@ mixture, independent and one standard deviation each,
     \quad \mathbf a = \Sigma_k^{-1} (\mathbf r - \alpha_k) .
 
 A fit of a star with design matrix J and weights W answers a change of the PSF
-with the shift :math:`(J^T W J)^{-1} J^T W\, \delta P`.
+with the shift :math:`(J^T W J)^{-1} J^T W\, \delta P`. Where pixels are so
+coarse that the shapes cannot say what a mixture lacks, the light in each pixel
+is off by a share of it besides.
 """
 from dataclasses import dataclass
 
@@ -28,7 +30,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 _NODES, _WEIGHTS = _NODES / 2, _WEIGHTS / 2
 # The columns of a file, and their units.
 COLUMNS = {'x': 'pix', 'y': 'pix', 'weight': '', 'mean': 'pix',
-           'covariance': 'pix2', 'change': ''}
+           'covariance': 'pix2', 'change': '', 'misfit': ''}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +46,14 @@ class PSFErrors:
         R independent changes of one standard deviation: of the weight, the
         mean x and y [pix] and the covariance xx, xy and yy [pix^2] of each
         Gaussian.
+    misfit : float, optional
+        The standard deviation of the light in a pixel, as a share of it, that
+        no change of the mixture explains.
     """
 
     grid: Grid
     changes: np.ndarray
+    misfit: float = 0.0
 
     def __post_init__(self):
         self.changes.flags.writeable = False
@@ -131,14 +137,15 @@ class PSFErrors:
         return PSFErrors(Grid(
             grid.x_grid, grid.y_grid, weights.reshape(m, -1),
             means.reshape(m, -1, 2), covariances.reshape(m, -1, 2, 2),
-            grid.scales), changes)
+            grid.scales), changes, self.misfit)
 
     def to_columns(self):
         """Return what a file holds of the errors, a row for each place."""
         x, y = self.grid.positions.T
         return {'x': x, 'y': y, 'weight': self.grid.weights,
                 'mean': self.grid.means, 'covariance': self.grid.covariances,
-                'change': self.changes}
+                'change': self.changes,
+                'misfit': np.full(len(x), self.misfit)}
 
     @classmethod
     def from_columns(cls, columns):
@@ -150,7 +157,10 @@ class PSFErrors:
         ValueError
             If a column is missing, or they are not those of a mixture.
         """
-        missing = [name for name in COLUMNS if name not in columns]
+        # Files once knew of no misfit.
+        misfit = columns.get('misfit', np.zeros(1))
+        missing = [name for name in COLUMNS if name not in columns
+                   and name != 'misfit']
         if missing:
             msg = ('errors of a PSF must have the columns '
                    f'{", ".join(COLUMNS)}, got no {missing[0]}')
@@ -163,10 +173,10 @@ class PSFErrors:
             columns['mean'].reshape(n, k, 2),
             columns['covariance'].reshape(n, k, 2, 2), np.ones(n))
         changes = columns['change'].reshape(n, -1, k, 6)
-        if not np.isfinite(changes).all():
+        if not (np.isfinite(changes).all() and np.isfinite(misfit).all()):
             msg = 'errors of a PSF must be finite, got NaN or infinity'
             raise ValueError(msg)
-        return cls(grid, np.array(changes))
+        return cls(grid, np.array(changes), float(misfit[0]))
 
 
 def responses(design, weight, changes):

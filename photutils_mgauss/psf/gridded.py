@@ -568,7 +568,8 @@ n_components=1)>
             return checked_arrays(
                 nodes['x'], nodes['y'], weights.reshape(n, -1),
                 means.reshape(n, -1, 2), covariances.reshape(n, -1, 2, 2),
-                scales)
+                # FITS has no axes of one element.
+                np.reshape(scales, n))
         report = tables.get('report')
         errors = tables.get('psf_errors')
         options = {'pixel_integrated': bool(model['pixel_integrated'][0]),

@@ -3,8 +3,9 @@ Errors of stars beyond those of independent pixels.
 
 What a star's fit makes of an error of its PSF, :math:`f\,\delta P_r`, is
 :math:`f (J^T W J)^{-1} J^T W\, \delta P_r`; the sum of the squares over the
-directions r is the PSF's part of the star's covariance. Where the noise of
-pixels is correlated, with the matrix R of correlations, the covariance is
+directions r is the PSF's part of the star's covariance, together with what
+light in the wrong pixels does. Where the noise of pixels is correlated, with
+the matrix R of correlations, the covariance is
 
 .. math::
 
@@ -177,7 +178,7 @@ class StarPixels:
         return node, phase, key
 
     def _shifts(self, node, phase, key, rows):
-        """Return shifts, covariances, derivatives and weights of stars."""
+        """Return shifts, covariances, derivatives, weights and PSFs."""
         _, first, which = np.unique(key[rows], return_index=True,
                                     return_inverse=True)
         some = rows[first]
@@ -191,12 +192,17 @@ class StarPixels:
             design = np.concatenate([design, np.ones_like(design[:, :1])], 1)
         # Fluxes in units of the flux: x and y then answer in pixels.
         shifts, inverse = responses(design, weight, images[:, 3:])
-        return shifts[:, :self.free.size], inverse, design, weight
+        return (shifts[:, :self.free.size], inverse, design, weight,
+                images[:, 0])
 
     def _part(self, node, phase, key, matrix, rows):
-        shifts, inverse, design, weight = self._shifts(node, phase, key, rows)
+        shifts, inverse, design, weight, light = self._shifts(
+            node, phase, key, rows)
         flux, n_free = self.values[rows, 0], self.free.size
         psf = shifts @ shifts.transpose(0, 2, 1)
+        if self.psf.misfit:
+            psf += self.psf.misfit**2 * _answer(
+                design, inverse, weight, light)[:, :n_free, :n_free]
         units = np.where(self.free == 0, flux[:, None], 1.0)
         psf *= units[:, :, None] * units[:, None]
         if matrix is None:
@@ -234,6 +240,18 @@ class StarPixels:
         usable = (inside.reshape(light.shape) & (variance > 0)
                   & np.isfinite(variance))
         return np.where(usable, 1 / np.where(usable, variance, 1), 0)
+
+
+def _answer(design, inverse, weight, light):
+    """
+    Return the covariances of fits to pixels that are off by their light.
+
+    No light is lost: what is missing in one pixel is in the others.
+    """
+    moved = inverse @ (design * (weight * light)[:, None])
+    total = light.sum(axis=1)[:, None, None]
+    moved -= moved.sum(axis=2, keepdims=True) * light[:, None] / total
+    return moved @ moved.transpose(0, 2, 1)
 
 
 def _growth(design, inverse, root, matrix, n_free):

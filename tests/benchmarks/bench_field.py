@@ -6,6 +6,8 @@ Positions with a PSF field from 150 stars, against the Cramer-Rao bound.
         [--peers psfex,empirical,epsf] [--time]
     python tests/benchmarks/bench_field.py --harness DIR --variants
         SCENE [SCENE ...]
+    python tests/benchmarks/bench_field.py --harness DIR --undersampled
+        TABLE [TABLE ...] [--seed 5]
     python tests/benchmarks/bench_field.py --decam DIR
 
 A scene is a folder with sci.fits, mask.fits, vartrue.fits, truth.ecsv and
@@ -23,6 +25,11 @@ with K = 5 and degree 3.
 the true PSF, and the bias of fluxes, both with the light beyond the stamps,
 for 150, 30 and 15 stars of the first scene, for 150 of its stars under 1,500
 cosmic rays, and for 150 stars of each other scene (steep, aberrated, ...).
+
+--undersampled takes tables of true PSFs on coarse pixels (of the class TruePSF
+of the harness) and prints a line for each: stars of 18 to 20 mag are fitted
+with the field of 150 other stars and with the true PSF, and stars without
+noise at 64 places in a pixel say how fluxes and positions change with that.
 
 --decam needs the folder with 117 stars of a DECam chip (decam_psfex) and
 psfex on the path, which models the same three quarters of the stars; the last
@@ -51,6 +58,8 @@ from photutils_mgauss import (
 )
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+from undersampled import print_camera
+
 from helpers.decam_chip import (
     decam_chip,
     find_catalogue,
@@ -467,15 +476,22 @@ def main():
     parser.add_argument('--degree', type=number, default=4)
     parser.add_argument('--peers', type=lambda s: s.split(','), default=[])
     parser.add_argument('--variants', action='store_true')
+    parser.add_argument('--undersampled', nargs='+', default=[])
+    parser.add_argument('--seed', type=int, default=5)
     parser.add_argument('--time', action='store_true')
     options = parser.parse_args()
     if options.decam:
         print_decam(options.decam)
-    if not options.scenes:
+    if not options.scenes and not options.undersampled:
         return
     if options.harness is None:
         parser.error('scenes need --harness, the folder of its modules')
     sys.path.insert(0, str(options.harness))
+    for name in options.undersampled:
+        from csst_psf import TruePSF
+        print_camera(name, TruePSF(name), fit_with_truth, options.seed)
+    if not options.scenes:
+        return
     if options.variants:
         print_variants(options)
         return

@@ -209,7 +209,7 @@ def test_a_grid_of_one_colour_is_that_of_the_field(field):
 
 @pytest.mark.parametrize('name', ['psf.fits', 'psf.asdf'])
 def test_files_keep_colours(field, tmp_path, name):
-    for psf in (field, field.to_grid((2, 3))):
+    for psf in (field, field.to_grid((2, 3)), field.to_grid((1, 1))):
         psf.write(tmp_path / name, overwrite=True)
         again = type(psf).read(tmp_path / name)
         if isinstance(psf, MixtureField):

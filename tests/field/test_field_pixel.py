@@ -23,6 +23,8 @@ from photutils_mgauss.field.normal import (
     to_coefficients,
 )
 from photutils_mgauss.field.stamps import Stamps
+from photutils_mgauss.psf.errors import PSFErrors
+from photutils_mgauss.psf.grid import Grid
 from photutils_mgauss.psf.phase import phase_error
 
 SHAPE = (180, 180)
@@ -32,8 +34,12 @@ OPTICS = GaussianMixture.from_stddevs(
     [0.1, -0.2])
 
 
-def image(optics, seed=3, photons=5e4):
-    """Return data, error and stars of an image of integrated optics."""
+def image(optics, seed=3, photons=5e4, misfit=0.0):
+    """
+    Return data, error and stars of an image of integrated optics.
+
+    The light in each pixel is off by a share of it.
+    """
     rng = np.random.default_rng(seed)
     grid = np.mgrid[15:170:17, 15:170:17].reshape(2, -1)
     x, y = grid + rng.uniform(-1, 1, grid.shape)
@@ -41,11 +47,13 @@ def image(optics, seed=3, photons=5e4):
                               pixel_integrated=True)
                 for place in zip(x, y, strict=True))
     error = np.sqrt(clean + 50)
-    return (clean + rng.normal(0, error), error, Table({'x': x, 'y': y}))
+    data = clean + rng.normal(0, error)
+    data += misfit * clean * rng.normal(size=SHAPE)
+    return data, error, Table({'x': x, 'y': y})
 
 
-def fitted(optics=OPTICS, **options):
-    data, error, stars = image(optics)
+def fitted(optics=OPTICS, misfit=0.0, **options):
+    data, error, stars = image(optics, misfit=misfit)
     return fit_mixture_field(data, stars, error=error, n_components=2,
                              degree=1, radius=6, **options)
 
@@ -132,6 +140,45 @@ def test_wide_stars_are_sampled_and_agree_with_integrated_ones():
     assert_allclose(flux, flux_i, rtol=1e-3)
     for one, other in ((x, x_i), (y, y_i)):
         assert_allclose(one - one.mean(), other - other.mean(), atol=5e-4)
+
+
+@pytest.mark.parametrize('share', [0.02, 0.05])
+def test_light_in_the_wrong_pixels_is_noticed(share):
+    assert fitted(misfit=share).accuracy == pytest.approx(share, rel=0.25)
+
+
+def test_no_light_is_in_the_wrong_pixels_of_few_gaussians(field):
+    assert field.accuracy < 0.003
+
+
+def test_stars_have_the_errors_that_light_in_the_wrong_pixels_makes():
+    rng = np.random.default_rng(5)
+    y, x = (7 + 15 * np.mgrid[:12, :12].reshape(2, -1)
+            + rng.uniform(-0.5, 0.5, (2, 144)))
+    data = np.zeros(SHAPE)
+    for place in zip(x, y, strict=True):
+        star = OPTICS.render(SHAPE, *place, flux=1e4, pixel_integrated=True)
+        moved = 0.03 * star * rng.normal(size=SHAPE)
+        data += star + moved - star * moved.sum() / star.sum()
+    nodes = Grid(np.array([90.0]), np.array([90.0]), OPTICS.weights[None],
+                 OPTICS.means[None], OPTICS.covariances[None], np.ones(1))
+    psf = GriddedMixturePSF(
+        [OPTICS], [(90, 90)], pixel_integrated=True,
+        errors=PSFErrors(nodes, np.zeros((1, 0, 2, 6)), 0.03))
+    table = MixturePSFPhotometry(psf, 11)(
+        data, error=np.full(SHAPE, 10.0), init_params=Table(
+            {'x_init': x, 'y_init': y, 'flux_init': np.full(x.size, 1e4)}))
+    for name, true in (('x', x), ('y', y), ('flux', 1e4)):
+        off = np.asarray(table[f'{name}_fit']) - true
+        assert off.std() == pytest.approx(
+            np.sqrt(np.mean(table[f'{name}_psf_err'] ** 2)), rel=0.2)
+
+
+def test_files_keep_how_much_light_is_in_the_wrong_pixels(tmp_path):
+    psf = fitted(misfit=0.03).to_grid((2, 2))
+    psf.write(tmp_path / 'psf.fits')
+    kept = GriddedMixturePSF.read(tmp_path / 'psf.fits')
+    assert kept.errors.misfit == psf.errors.misfit > 0.02
 
 
 @pytest.mark.parametrize('ending', ['fits', 'asdf'])

@@ -109,6 +109,52 @@ def test_stars_without_wings_get_none():
     assert field.wing_share == 0
 
 
+def test_by_default_light_that_is_seen_is_in_the_flux(fields, sharp, caplog):
+    data, error, stars = sharp
+    caplog.set_level('INFO', 'photutils_mgauss')
+    field = fit_mixture_field(data, stars, error=error, n_components=4,
+                              degree=0)
+    assert field == fields['curve-of-growth']
+    assert 'of the light of stars is beyond their stamps' in caplog.text
+
+
+def test_by_default_light_that_is_not_seen_is_not_added(caplog):
+    psf = GaussianMixture([1], [[0, 0]], [[[1.5, 0], [0, 1.5]]])
+    data, error, stars = image(psf.evaluate, seed=4)
+    options = {'error': error, 'n_components': 1, 'degree': 0}
+    caplog.set_level('INFO', 'photutils_mgauss')
+    field = fit_mixture_field(data, stars, **options)
+    plain = fit_mixture_field(data, stars, normalise='stamps', **options)
+    assert 'stars show no light beyond their stamps' in caplog.text
+    assert field.mixture_at(3, 4) == plain.mixture_at(3, 4)
+    # What may be there, though it was not seen.
+    assert field.wing_error > 0
+    caplog.clear()
+    few = fit_mixture_field(data, stars[:3], **options)
+    assert few.wing_share == 0
+    assert 'needs at least 5 stars' in caplog.text
+
+
+def test_a_psf_that_leaves_light_has_larger_errors(sharp):
+    data, error, stars = sharp
+    options = {'error': error, 'degree': 0, 'normalise': 'stamps'}
+    poor, good = (fit_mixture_field(data, stars, n_components=k, **options)
+                  for k in (2, 4))
+    inside = [np.abs(field.aperture_correction(5, 200, 200) * moffat_inside(
+        5) / moffat_inside(10) - field.aperture_correction(10, 200, 200))
+        for field in (poor, good)]
+    errors = [field.aperture_correction_error(5, 200, 200)
+              for field in (poor, good)]
+    assert errors[0] > 10 * errors[1]
+    assert 0.2 < errors[0] / inside[0] < 5
+
+
+def moffat_inside(radius, fwhm=2.2, slope=1.75):
+    """Return the share of the light of `sharp` inside a radius."""
+    width = fwhm / 2 / np.sqrt(2 ** (1 / slope) - 1)
+    return 1 - (1 + radius**2 / width**2) ** (1 - slope)
+
+
 def test_too_few_stars_for_a_curve_of_growth_are_an_error(sharp):
     data, error, stars = sharp
     with pytest.raises(ValueError, match='needs at least 5 stars'):

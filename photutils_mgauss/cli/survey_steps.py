@@ -1,0 +1,13 @@
+"""The commands that a survey is made of."""
+import argparse
+
+from photutils_mgauss.cli import info, motions, photometry, psf
+
+
+def step_parser():
+    """Return a parser of these commands alone."""
+    parser = argparse.ArgumentParser(prog='mgauss')
+    commands = parser.add_subparsers(required=True, dest='command')
+    for module in (psf, photometry, motions, info):
+        module.add(commands)
+    return parser

@@ -1,0 +1,93 @@
+"""Pixels that are saturated, and those their charge has run into."""
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import binary_dilation, find_objects, label
+
+from photutils_mgauss.utils.image import read_level
+from photutils_mgauss.utils.validation import as_real
+
+# A trail goes on while a pixel has this fraction of the level and is so many
+# times as bright as those so far beside it.
+_TRAIL_LEVEL, _TRAIL_CONTRAST, _BESIDE = 0.25, 3.0, 3
+_SQUARE = np.ones((3, 3), bool)
+
+
+def as_saturation(value):
+    """
+    Check a level of saturation; None is none, infinity that masks alone tell.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is neither positive nor infinite.
+    """
+    if value is None or (np.isscalar(value) and value == np.inf):
+        return value
+    return (value if hasattr(value, 'unit')
+            else as_real(value, 'saturation', above=0))
+
+
+def saturated_pixels(pixels, level):
+    """
+    Tell which pixels are of no use near saturated ones.
+
+    Those at the level or above, those that their charge has run into along
+    rows or columns, and a pixel around all of them.
+
+    Parameters
+    ----------
+    pixels : PixelData
+        One image.
+    level : float, `~astropy.units.Quantity` or inf
+        In the unit of the image if it has none; at infinity are pixels that
+        are not finite.
+
+    Returns
+    -------
+    (ny, nx) `~numpy.ndarray` of bool
+    """
+    if np.isscalar(level) and level == np.inf:
+        return ~np.isfinite(pixels.data)
+    level = read_level(level, 'saturation', pixels.unit)
+    data = np.asarray(pixels.data)
+    with np.errstate(invalid='ignore'):
+        full = data >= level
+    if not full.any():
+        return full
+    trails = full.copy()
+    clumps, _ = label(full, _SQUARE)
+    for box in find_objects(clumps):
+        for turned in (False, True):
+            _mark_trail(*((a.T if turned else a) for a in (data, trails)),
+                        box[::-1] if turned else box, level)
+    return binary_dilation(trails, _SQUARE)
+
+
+def without_saturated(pixels, level):
+    """Return an image with saturated pixels masked; None is no level."""
+    if level is None:
+        return pixels
+    full = saturated_pixels(pixels, level)
+    return replace(pixels, mask=full if pixels.mask is None
+                   else pixels.mask | full)
+
+
+def _mark_trail(data, out, box, level):
+    """Mark what is bright beyond both ends of the columns of a clump."""
+    rows, columns = box
+    nx = data.shape[1]
+    beside = [min(max(c, 0), nx - 1) for c in (columns.start - _BESIDE,
+                                               columns.stop - 1 + _BESIDE)]
+    # Trails of several columns start from the whole clump, those of one from
+    # its ends.
+    for first, step in ((rows.stop, 1), (rows.start - 1, -1)):
+        row = first
+        while 0 <= row < data.shape[0]:
+            part = np.nan_to_num(data[row, columns])
+            least = max(_TRAIL_LEVEL * level,
+                        _TRAIL_CONTRAST * np.nanmean(data[row, beside]))
+            if not (part > least).any():
+                break
+            out[row, columns] |= part > least
+            row += step
