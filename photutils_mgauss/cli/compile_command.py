@@ -61,6 +61,8 @@ def examples():
         data, stars, error=error, n_components=1, degree=0)
     yield 'crowded fields', lambda: package.CrowdedMixturePhotometry(psf)(
         data, error=error)
+    yield 'crowded fields in many images', lambda: _fit_images(
+        package, psf, data, error)
     yield 'simulated images', lambda: _simulate(package, psf, integrated)
 
 
@@ -85,15 +87,26 @@ def _scene(package):
 
 def _fit_many(package, psf, data, error):
     """Fit two stars to an image with a WCS."""
+    image, wcs = _on_sky(data, error)
+    package.fit_many([(image, psf, wcs)],
+                     wcs.pixel_to_world([20.3, 40.3], [19.8, 39.8]))
+
+
+def _fit_images(package, psf, data, error):
+    """Find the stars of an image with a WCS as if it were of many."""
+    image, wcs = _on_sky(data, error)
+    package.CrowdedMixturePhotometry(psf).fit_images([(image, psf, wcs)])
+
+
+def _on_sky(data, error):
+    """Return an image with its errors, and a WCS."""
     from astropy.nddata import NDData, StdDevUncertainty
     from astropy.wcs import WCS
 
     wcs = WCS(naxis=2)
     wcs.wcs.ctype = 'RA---TAN', 'DEC--TAN'
     wcs.wcs.cdelt = -1e-5, 1e-5
-    image = NDData(data, uncertainty=StdDevUncertainty(error))
-    package.fit_many([(image, psf, wcs)],
-                     wcs.pixel_to_world([20.3, 40.3], [19.8, 39.8]))
+    return NDData(data, uncertainty=StdDevUncertainty(error)), wcs
 
 
 def _use_models(package, psf, integrated, data, error):

@@ -1,11 +1,11 @@
 """``mgauss photometry``: images and PSFs to catalogues."""
 import os
 import warnings
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 from photutils_mgauss.cli import psf as psf_command
-from photutils_mgauss.cli import tools
+from photutils_mgauss.cli import together, tools
 from photutils_mgauss.cli.progress import Progress
 from photutils_mgauss.cli.results import (
     Results,
@@ -42,7 +42,7 @@ def add(commands):
     parser.add_argument('--output', metavar='NAME',
                         help='folder, or for a single image a file: .ecsv or '
                              '.fits (default: IMAGE_cat.ecsv)')
-    add_measuring(parser)
+    together.add_option(add_measuring(parser))
     tools.add_times(parser)
     tools.add_reading(parser)
     add_checkpoint(parser)
@@ -51,7 +51,7 @@ def add(commands):
 
 
 def add_measuring(parser):
-    """Add the options of the measurement."""
+    """Add the options of the measurement; return their group."""
     group = parser.add_argument_group('the measurement')
     group.add_argument('--crowded', action='store_true',
                        help='find and fit all stars and the sky together')
@@ -64,6 +64,7 @@ def add_measuring(parser):
     group.add_argument('--magnitudes', action='store_true',
                        help='add AB magnitudes; for images in MJy/sr or a '
                             'unit of flux density')
+    return group
 
 
 def run(options):
@@ -75,6 +76,10 @@ def run(options):
             'one of an image, and --crowded one of the stars of each image')
     tools.check_inputs([*paths, *options.psf])
     tools.check_different(paths)
+    if options.together:
+        together.run(options, cache(partial(
+            _read_psf, checkpoint=options.checkpoint)))
+        return
     names = tools.output_names(paths, options.output, '_cat', _SUFFIXES,
                                '.ecsv')
     owners = tools.one_each(options.psf, len(paths), 'psf')

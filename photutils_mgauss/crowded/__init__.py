@@ -12,6 +12,11 @@ to the table, and who is beside whom; `table` says what is reported of each.
 for `own_psf`, that has `fit_crowded_psf`. `injection` has
 `inject_and_recover`, artificial stars for completeness and errors. Changing
 where tiles are cut must not change a star: tests hold that.
+
+Many images of one field go the same way. Start at `many_images`: `many_plan`
+cuts the sky into tiles, `many_solve` solves one, `many_search` adds up the
+evidence of all images, `many_tile` has one `model` for each image and the
+stars of all, `many_equations` their joint fit, `many_table` what comes out.
 """
 from photutils_mgauss.utils.lazy import hand_on
 
@@ -20,5 +25,5 @@ __getattr__, __dir__, __all__ = hand_on(__name__, {
     'fit_crowded_psf': 'own_psf',
     'inject_and_recover': 'injection',
     'InjectionResult': 'injection',
-    'UnfinishedTilesError': 'photometry',
+    'UnfinishedTilesError': 'unfinished',
 })

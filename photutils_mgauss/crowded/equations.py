@@ -12,20 +12,20 @@ from photutils_mgauss import kernels
 from photutils_mgauss.crowded.stars import Neighbours
 
 # A step of Gauss-Newton moves a star no further than this [pix].
-_MAX_MOVE = 0.4
+MAX_MOVE = 0.4
 # Nor does it change a flux by more than these factors.
-_LEAST_CHANGE, _MOST_CHANGE = 0.2, 2.5
+_LEAST_CHANGE, MOST_CHANGE = 0.2, 2.5
 # Joint equations are solved until the residual is this fraction of what it
 # was: what is left over would depend on what else is on the tile.
-_TOLERANCE = 1e-6
-_CG_STEPS = 400
+TOLERANCE = 1e-6
+CG_STEPS = 400
 # Where stars are so many that together they can be a background, its steps
 # are to be small: this is added to the information of nodes, as a fraction,
 # times the mean square of the pixels' residuals, in standard errors and at
 # most so large. Where the stars are not yet the right ones the sky is stiff.
 _LEVEL_DAMPING, _LARGEST_SQUARE = 0.1, 100.0
 # What is known beforehand moves no flux by more standard errors than this.
-_STRONGEST_PULL = 0.5
+STRONGEST_PULL = 0.5
 # Pixels further than this from the model take no part in the background.
 _BACKGROUND_CLIP = 4.0
 
@@ -61,7 +61,7 @@ class Equations:
         n = len(stars.matrix)
         step = np.zeros(3 * n + self.mesh.gradient.size)
         kernels.solve_joint(
-            stars, self.neighbours.pairs, mesh, _TOLERANCE, _CG_STEPS,
+            stars, self.neighbours.pairs, mesh, TOLERANCE, CG_STEPS,
             np.empty((n, 3, 3)), np.empty((4, step.size)), step)
         return step[:3 * n].reshape(n, 3), step[3 * n:]
 
@@ -73,7 +73,7 @@ class Equations:
         mesh = self.mesh._replace(gradient=0 * self.mesh.gradient)
         step = np.zeros(3 * n + mesh.gradient.size)
         kernels.solve_joint(
-            stars, self.neighbours.pairs, mesh, _TOLERANCE, _CG_STEPS,
+            stars, self.neighbours.pairs, mesh, TOLERANCE, CG_STEPS,
             np.empty((n, 3, 3)), np.empty((4, step.size)), step)
         return step[:3 * n:3]
 
@@ -98,9 +98,9 @@ def limited(step, stars):
     """Return a step (n, 3) no longer than stars may go at once."""
     out = np.empty_like(step)
     out[:, 0] = np.clip(step[:, 0], (_LEAST_CHANGE - 1) * stars.flux,
-                        (_MOST_CHANGE - 1) * stars.flux)
+                        (MOST_CHANGE - 1) * stars.flux)
     for k, drift in enumerate(stars.drift, 1):
-        move = np.clip(step[:, k], -_MAX_MOVE, _MAX_MOVE)
+        move = np.clip(step[:, k], -MAX_MOVE, MAX_MOVE)
         out[:, k] = np.where(np.isfinite(stars.bound), np.clip(
             move, -stars.bound - drift, stars.bound - drift), move)
     return out
@@ -132,7 +132,7 @@ def _expect(equations, stars, count_slope):
     # it drive out what may be real.
     own = np.maximum(equations.matrix[:, 0, 0], 0)
     pull = np.minimum(count_slope / np.maximum(stars.flux, 1e-300),
-                      _STRONGEST_PULL * np.sqrt(own))
+                      STRONGEST_PULL * np.sqrt(own))
     equations.gradient[:, 0] -= np.where(stars.hold > 0, 0, pull)
 
 

@@ -7,8 +7,6 @@ takes the star it means, and entries that mean none get one of their own.
 import numpy as np
 from scipy.spatial import cKDTree
 
-from photutils_mgauss.crowded.search import leave_out
-
 # A star further from its entry has to be this much brighter to be the one: a
 # factor of exp(d^2 / 2) at d times this distance [pix].
 _ENTRY_DISTANCE = 0.3
@@ -16,7 +14,7 @@ _ENTRY_DISTANCE = 0.3
 # root of the PSF's area cannot be told from it.
 _SAME = 0.25
 # Damping of the steps in which stars without fluxes find theirs.
-_WARM_UP = (1.0, 0.3, 0.1, 0.03)
+WARM_UP = (1.0, 0.3, 0.1, 0.03)
 
 
 def warm_up(tile, listed):
@@ -28,23 +26,26 @@ def warm_up(tile, listed):
     peak = np.maximum(model.data[y, x] - model.level.min(), model.noise)
     tile.start(listed.replaced(flux=np.where(
         listed.flux > 0, listed.flux, peak / model.psf.profile[0])))
-    for damping in _WARM_UP:
+    for damping in WARM_UP:
         tile.step(damping)
 
 
-def associate(tile, listed):
+def associate(tile, listed, leave_out):
     """Give stars of a tile to the entries of a list; add what it lacks."""
-    same = _SAME * np.sqrt(tile.model.psf.area)
+    same = _SAME * np.sqrt(tile.area)
     bound = tile.options.xy_bounds
     # Without bounds, whatever is near enough to be seen as one will do.
     radius = max(same, bound) if np.isfinite(bound) else 4 * same
-    entry, star = pair_up(listed, tile.model.stars, radius)
+    entry, star = pair_up(listed, tile.stars, radius)
     tile.bind(star, listed.chosen(entry))
     left = np.setdiff1d(np.arange(len(listed)), entry)
-    _add(tile, _without_repeats(tile, listed.chosen(left), same))
-    tile.step(0.05, _beside_added(tile.model))
+    # What is hardly seen is taken to be where the list says it is.
+    spread = min(tile.options.xy_bounds, 1.0) / 2
+    tile.admit_listed(_without_repeats(tile, listed.chosen(left), same),
+                      spread)
+    tile.step(0.05, _beside_added(tile))
     leave_out(tile, tile.options.keep)
-    tile.step(0.05, _beside_added(tile.model))
+    tile.step(0.05, _beside_added(tile))
 
 
 def pair_up(entries, stars, radius):
@@ -77,7 +78,7 @@ def _tree(stars):
 
 def _without_repeats(tile, entries, same):
     """Note which entries mean the star of another; return the others."""
-    named = tile.model.stars.chosen(tile.model.stars.listed)
+    named = tile.stars.chosen(tile.stars.listed)
     if len(named) and len(entries):
         gap, at = _tree(named).query(np.column_stack([entries.x, entries.y]))
         near = gap < same
@@ -94,25 +95,10 @@ def _without_repeats(tile, entries, same):
     return entries.chosen(keep)
 
 
-def _beside_added(model):
+def _beside_added(tile):
     """Tell which stars are entries without a star, or near one of them."""
     # All others are what they are without a list.
-    added, near = model.stars.hold > 0, model.neighbours
+    added, near = tile.stars.hold > 0, tile.neighbours
     beside = added.copy()
     beside[near.owner[added[near.neighbour]]] = True
     return beside
-
-
-def _add(tile, entries):
-    """Add entries without a star, as bright as the residual allows."""
-    model = tile.model
-    n = len(model.stars)
-    least = np.full(len(entries), 0.1 * model.noise / model.psf.profile[0])
-    # What is hardly seen is taken to be where the list says it is.
-    spread = min(tile.options.xy_bounds, 1.0) / 2
-    tile.admit(entries.replaced(flux=least, flux_init=least.copy(),
-                                hold=np.full(len(entries), spread**-2)))
-    information = tile.equations.stars.matrix[n:, 0, 0]
-    more = np.divide(tile.equations.stars.gradient[n:, 0], information,
-                     where=information > 0, out=np.zeros(len(entries)))
-    tile.brighten(np.s_[n:], np.maximum(more, 0))

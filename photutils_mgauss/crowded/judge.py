@@ -19,20 +19,21 @@ _NEEDED = 0.5
 _AT_ONCE = 4096
 
 
-def smooth_light(model):
-    """Tell which stars (n,) a smooth surface explains as well."""
-    stars = model.stars
-    out = np.zeros(len(stars), bool)
-    near = model.neighbours
+def smooth_light(models):
+    """Tell which stars (n,) smooth surfaces explain as well in all images."""
+    near = models[0].neighbours
+    out = np.zeros(near.distance.size, bool)
     # Alone, a star is what its residual says.
     crowded = np.flatnonzero(np.diff(near.indptr) >= 2)
     for first in range(0, crowded.size, _AT_ONCE):
         which = crowded[first:first + _AT_ONCE]
-        out[which] = _is_smooth(model, which)
+        worse, own = sum(_needed(model, which) for model in models)
+        out[which] = worse < _NEEDED * own
     return out
 
 
-def _is_smooth(model, which):
+def _needed(model, which):
+    """Return how much worse a surface is, and what it should be (2, n)."""
     s, (ny, nx) = model.stars, model.data.shape
     j, i = (v.ravel() for v in np.indices((2 * _HALF + 1, 2 * _HALF + 1))
             - _HALF)
@@ -49,7 +50,7 @@ def _is_smooth(model, which):
     # What stars have left over may have a slope of its own.
     worse = (_rest(residual + light, weight, terms)
              - _rest(residual, weight, terms))
-    return worse < _NEEDED * _rest(own, weight, terms)
+    return np.stack([worse, _rest(own, weight, terms)])
 
 
 def _light(model, which, x, y):

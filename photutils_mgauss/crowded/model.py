@@ -101,7 +101,7 @@ class Model:
         """Choose stamps and wings, list neighbours, and draw everything."""
         everyone = np.arange(len(self.stars))
         self.wing, self.stamps = self._frames(everyone, 0)
-        self.neighbours = Neighbours.of(self.stars.x, self.stars.y)
+        self._connect()
         self._localise_psf()
         self._draw_stamps(everyone)
         self.residual = self.data - self.background()
@@ -158,6 +158,9 @@ class Model:
 
     def _reconnect(self):
         self._weigh()
+        self._connect()
+
+    def _connect(self):
         self.neighbours = Neighbours.of(self.stars.x, self.stars.y)
 
     def take(self, step, level_step):
@@ -169,10 +172,11 @@ class Model:
     def take_in_place(self, step, level_step, changed):
         """Take a step that changes some stars only; stamps stay in place."""
         self._add_stars(changed, 1.0)
-        before = self.background()
+        before = self.level
         self.take(step, level_step)
         self._draw_stamps(changed)
-        self.residual += before - self.background()
+        # The background is linear in its levels.
+        self.residual += self.mesh.image(before - self.level)
         self._add_stars(changed, -1.0)
         self._weigh()
 

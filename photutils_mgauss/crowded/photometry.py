@@ -20,6 +20,7 @@ from photutils_mgauss.crowded.table import (
     positions,
 )
 from photutils_mgauss.crowded.tile import TileOptions
+from photutils_mgauss.crowded.unfinished import UnfinishedTilesError
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.psf.star_errors import add_psf_errors
@@ -31,7 +32,7 @@ from photutils_mgauss.utils.saturation import as_saturation, without_saturated
 from photutils_mgauss.utils.star_columns import column_values, read_sources
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
-__all__ = ['CrowdedMixturePhotometry', 'UnfinishedTilesError']
+__all__ = ['CrowdedMixturePhotometry']
 
 # A PSF whose size is off by more than this fraction is warned of.
 _WIDTH_TOLERANCE = 0.1
@@ -40,52 +41,6 @@ _CONFUSION = ('errors and fluxes allow for stars that were not found; what of '
               'stars')
 # Stars are drawn out to where this fraction of the noise is left of them.
 _FAINTEST = 1e-3
-
-
-class UnfinishedTilesError(RuntimeError):
-    """
-    Raised when some tiles of an image could not be solved.
-
-    Parameters
-    ----------
-    unfinished : list of (y_low, y_high, x_low, x_high) tuple of int
-        The parts of the image, in pixels, without a result.
-    table : `~astropy.table.QTable`
-        The stars of the tiles that were finished.
-
-    Examples
-    --------
-    Take what there is, and solve the rest again:
-
-    >>> import numpy as np
-    >>> from concurrent.futures import ThreadPoolExecutor
-    >>> from photutils_mgauss import (CrowdedMixturePhotometry,
-    ...                               GaussianMixture, GriddedMixturePSF,
-    ...                               UnfinishedTilesError)
-    >>> mixture = GaussianMixture([1], [[0, 0]], [[[0.7, 0], [0, 0.8]]])
-    >>> psf = GriddedMixturePSF([mixture], [(0, 0)])
-    >>> pool = ThreadPoolExecutor()
-    >>> pool.shutdown()  # all of its workers are gone
-    >>> phot = CrowdedMixturePhotometry(psf, executor=pool)
-    >>> try:
-    ...     table = phot(np.ones((40, 50)), error=np.ones((40, 50)))
-    ... except UnfinishedTilesError as error:
-    ...     table, left = error.table, error.unfinished
-    >>> left
-    [(0, 40, 0, 50)]
-    >>> len(table)
-    0
-    """
-
-    def __init__(self, unfinished, table):
-        self.unfinished = unfinished
-        self.table = table
-        super().__init__(unfinished, table)
-
-    def __str__(self):
-        return (f'{len(self.unfinished)} tiles were not finished, at (y_low, '
-                f'y_high, x_low, x_high) = {self.unfinished}; the stars of '
-                f'the others are in the attribute table')
 
 
 class CrowdedMixturePhotometry:
@@ -319,7 +274,7 @@ class CrowdedMixturePhotometry:
         given = (None if init_params is None
                  else self._listed(init_params, image.unit))
         psf = self._psf_of(image)
-        options = self._options(image)
+        options = self.options_of(image)
         plan = Plan(image, psf, options, self.tile_shape, self.overlap,
                     given, self._checkpoint)
         outcomes, errors = run(plan, self.executor, self.progress_bar)
@@ -335,15 +290,91 @@ class CrowdedMixturePhotometry:
             raise UnfinishedTilesError(unfinished, table) from errors[0]
         return table
 
+    def fit_images(self, images, stars=None, *, motions=False):
+        """
+        Find and fit the stars of one field in many images together.
+
+        The images may be shifted, rotated, of other filters, depths and PSFs.
+        There is one list of stars, found in the evidence of all images, with
+        places in common and a flux for each image, whether or not the star
+        is significant there.
+
+        Parameters
+        ----------
+        images : sequence of (data, psf, wcs) or `ImageEpoch`
+            As for `fit_many`, with the sky left in. Where ``psf`` is None it
+            is ``psf_model`` or, without one, made of the image's own stars.
+        stars : `~astropy.table.Table` or SkyCoord, optional
+            The stars to report, with ``ra`` and ``dec`` [deg]. None is added,
+            none left out, and the result has their order.
+        motions : bool, optional
+            Whether each star has a proper motion of its own; for `ImageEpoch`.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            ``id``, ``ra``, ``dec`` [deg], ``ra_error``, ``dec_error`` [mas],
+            ``radec_cov`` [mas^2] and, with motions, ``pmra``, ``pmdec``
+            [mas / yr] with errors; for each of E images ``x_fit``, ``y_fit``
+            [pix], ``flux``, ``flux_err``, ``local_bkg``, ``n_pixels_fit``,
+            ``image_chi2`` and ``crowding``, (n, E), NaN where an image does
+            not show the star; ``n_images`` that do, and for all of them
+            ``significance``, ``reduced_chi2``, ``flags`` and what is said of
+            neighbours.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is not valid.
+        UnfinishedTilesError
+            If a worker failed; the finished tiles are in the error.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from astropy.nddata import NDData, StdDevUncertainty
+        >>> from astropy.wcs import WCS
+        >>> from photutils_mgauss import (CrowdedMixturePhotometry,
+        ...                               GaussianMixture, GriddedMixturePSF)
+        >>> wcs = WCS(naxis=2)
+        >>> wcs.wcs.ctype = 'RA---TAN', 'DEC--TAN'
+        >>> wcs.wcs.cdelt = -1e-5, 1e-5
+        >>> mixture = GaussianMixture([1], [[0, 0]], [[[0.7, 0], [0, 0.8]]])
+        >>> psf = GriddedMixturePSF([mixture], [(0, 0)])
+        >>> rng = np.random.default_rng(1)
+        >>> images = []
+        >>> for flux in (250, 500):
+        ...     data = 20 + mixture.render((40, 40), 15.2, 17, flux=flux)
+        ...     error = np.sqrt(data)
+        ...     noisy = data + error * rng.normal(size=data.shape)
+        ...     images.append((NDData(noisy, StdDevUncertainty(error)), psf,
+        ...                    wcs))
+        >>> table = CrowdedMixturePhotometry(None).fit_images(images)
+        >>> len(table), table['flux'].shape
+        (1, (1, 2))
+        """
+        from photutils_mgauss.crowded.many_images import fit_images
+        table, unfinished, errors = fit_images(self, images, stars,
+                                               motions=motions)
+        if unfinished:
+            raise UnfinishedTilesError(unfinished, table) from errors[0]
+        return table
+
     def _psf_of(self, image):
         """Return the PSF of an image, made of its stars if none is known."""
         if self._psf is not None:
             return self._psf
+        return LocalPSF.of(self.model_of(image))
+
+    def model_of(self, image):
+        """Return the PSF model, made of an image's stars if none is known."""
+        if self.psf_model is not None:
+            return self.psf_model
         from photutils_mgauss.crowded.psf_loop import LoopOptions
         field, model = self.fit_field(image, LoopOptions(
             progress_bar=self.progress_bar))
         keep(self, field=field, psf_used=model)
-        return LocalPSF.of(model)
+        return model
 
     def fit_field(self, image, options):
         """
@@ -373,13 +404,15 @@ class CrowdedMixturePhotometry:
 
     def _listed(self, init_params, unit):
         x, y, flux, number = _given(init_params, unit)
-        return Stars(x, y, flux, number=number, bound=self._bound)
+        return Stars(x, y, flux, number=number, bound=self.bound)
 
     @property
-    def _bound(self):
+    def bound(self):
+        """How far a listed star may be from its place [pix]."""
         return np.inf if self.xy_bounds is None else self.xy_bounds
 
-    def _options(self, image):
+    def options_of(self, image):
+        """Return the `TileOptions` of a `PixelData` with errors."""
         _, variance = image.sample()
         gain = self.effective_gain
         if gain is None:
@@ -393,7 +426,7 @@ class CrowdedMixturePhotometry:
             floor=float(variance.min()),
             noise=float(np.sqrt(np.median(variance))),
             max_rounds=self.maxiters, find_neighbors=self.find_neighbors,
-            xy_bounds=self._bound,
+            xy_bounds=self.bound,
             depth=self.depth, count_slope=self.count_slope,
             confusion=self.confusion)
 

@@ -51,64 +51,20 @@ class Outcome:
                 'tile_sums': np.array([self.chi2, self.n_pixels], float)}
 
 
-@dataclass(frozen=True)
-class Plan:
+class Tiles:
     """
-    How an image is cut into tiles.
+    What is common to plans: pieces of work that are known by their cores.
 
-    ``tile_shape`` is the largest shape of a tile, None that of a size that
-    does not need much memory and leaves work for more than one worker.
-    ``given`` is None, or the stars of a list. ``checkpoint`` keeps the tiles
-    that are finished.
+    A plan has ``cores``, what makes the ``job`` of one, and ``solve``, which
+    workers call with it; ``checkpoint`` keeps the tiles that are finished.
     """
-
-    image: PixelData
-    psf: LocalPSF
-    options: TileOptions
-    tile_shape: tuple | None
-    overlap: int
-    given: Stars | None
-    checkpoint: Checkpoint | None = None
-
-    @property
-    def cores(self):
-        """The pixels (y_low, y_high, x_low, x_high) of each tile."""
-        shape = self.image.shape
-        size = min(max(-(-max(shape) // 2), _TILES[0]), _TILES[1])
-        rows, columns = (_even_parts(n, tile) for n, tile in zip(
-            shape, self.tile_shape or (size, size), strict=True))
-        return [(*row, *column) for row in rows for column in columns]
-
-    def job(self, core):
-        """Cut out a tile."""
-        ny, nx = self.image.shape
-        margin = self.options.background_size or 0
-        y_low, y_high = _window(core[:2], ny, self.overlap, margin)
-        x_low, x_high = _window(core[2:], nx, self.overlap, margin)
-        part = None
-        if self.given is not None:
-            x, y = self.given.x, self.given.y
-            near = ((x > x_low - 1) & (x < x_high) & (y > y_low - 1)
-                    & (y < y_high))
-            part = self.given.chosen(near).moved(-x_low, -y_low)
-        return TileJob(*self.image.part(np.s_[y_low:y_high, x_low:x_high]),
-                       self.psf.moved(x_low, y_low), self.options,
-                       (y_low, x_low), self._reported(core), part)
-
-    def _reported(self, core):
-        """Return where the stars are that the tile of a core reports."""
-        # The outermost tiles also own the stars just outside the image.
-        ny, nx = self.image.shape
-        return (core[0] or -self.overlap,
-                core[1] if core[1] < ny else ny + self.overlap,
-                core[2] or -self.overlap,
-                core[3] if core[3] < nx else nx + self.overlap)
 
     def work(self, core):
         """Cut out a tile and solve it, if that has not been done before."""
         job = self.job(core)
         outcome = self.kept(job)
-        return self.keep(job, Outcome.of(job)) if outcome is None else outcome
+        return (self.keep(job, self.solve(job)) if outcome is None
+                else outcome)
 
     def kept(self, job):
         """Return the outcome of a tile that was finished before, or None."""
@@ -122,6 +78,75 @@ class Plan:
         return outcome
 
 
+@dataclass(frozen=True)
+class Plan(Tiles):
+    """
+    How an image is cut into tiles.
+
+    ``tile_shape`` is the largest shape of a tile, None that of a size that
+    does not need much memory and leaves work for more than one worker.
+    ``given`` is None, or the stars of a list.
+    """
+
+    solve = staticmethod(Outcome.of)
+
+    image: PixelData
+    psf: LocalPSF
+    options: TileOptions
+    tile_shape: tuple | None
+    overlap: int
+    given: Stars | None
+    checkpoint: Checkpoint | None = None
+
+    @property
+    def cores(self):
+        """The pixels (y_low, y_high, x_low, x_high) of each tile."""
+        shape = self.image.shape
+        return cut(shape, self.tile_shape or 2 * (tile_size(shape),))
+
+    def job(self, core):
+        """Cut out a tile."""
+        ny, nx = self.image.shape
+        margin = self.options.background_size or 0
+        y_low, y_high = window(core[:2], ny, self.overlap, margin)
+        x_low, x_high = window(core[2:], nx, self.overlap, margin)
+        part = given_in(self.given, (y_low, y_high, x_low, x_high))
+        return TileJob(*self.image.part(np.s_[y_low:y_high, x_low:x_high]),
+                       self.psf.moved(x_low, y_low), self.options,
+                       (y_low, x_low),
+                       reported(core, (ny, nx), self.overlap), part)
+
+
+def tile_size(shape):
+    """Return the largest side of tiles of an image if none is given."""
+    return min(max(-(-max(shape) // 2), _TILES[0]), _TILES[1])
+
+
+def cut(shape, tile_shape):
+    """Return the cores (y_low, y_high, x_low, x_high) of even tiles."""
+    rows, columns = (_even_parts(n, tile) for n, tile in zip(
+        shape, tile_shape, strict=True))
+    return [(*row, *column) for row in rows for column in columns]
+
+
+def reported(core, shape, overlap):
+    """Return where the stars are that the tile of a core reports."""
+    # The outermost tiles also own the stars just outside the image.
+    ny, nx = shape
+    return (core[0] or -overlap, core[1] if core[1] < ny else ny + overlap,
+            core[2] or -overlap, core[3] if core[3] < nx else nx + overlap)
+
+
+def given_in(given, window):
+    """Return the listed stars of a window, in its pixels, or None."""
+    if given is None:
+        return None
+    y_low, y_high, x_low, x_high = window
+    x, y = given.x, given.y
+    near = ((x > x_low - 1) & (x < x_high) & (y > y_low - 1) & (y < y_high))
+    return given.chosen(near).moved(-x_low, -y_low)
+
+
 def _even_parts(size, largest):
     """Return (low, high) of as few even parts as the largest part allows."""
     part = -(-size // -(-size // largest))
@@ -130,7 +155,7 @@ def _even_parts(size, largest):
     return [(low, min(low + part, size)) for low in range(0, size, part)]
 
 
-def _window(core, size, overlap, spacing):
+def window(core, size, overlap, spacing):
     """
     Return which pixels a tile sees along an axis.
 
@@ -166,13 +191,13 @@ def run(plan, executor, progress_bar):
 def _run_elsewhere(plan, executor, progress_bar):
     """Solve tiles where workers get no more than their tile."""
     if not plan.checkpoint:
-        return _collect(executor, Outcome.of, map(plan.job, plan.cores),
+        return _collect(executor, plan.solve, map(plan.job, plan.cores),
                         progress_bar)
     before = [plan.kept(plan.job(core)) for core in plan.cores]
     left = [core for core, outcome in zip(plan.cores, before, strict=True)
             if outcome is None]
     found, errors = _collect(
-        executor, Outcome.of, map(plan.job, left), progress_bar,
+        executor, plan.solve, map(plan.job, left), progress_bar,
         lambda i, outcome: plan.keep(plan.job(left[i]), outcome))
     found = iter(found)
     return [next(found) if outcome is None else outcome
@@ -189,8 +214,10 @@ def _collect(pool, work, tasks, progress_bar, keep=None):
             errors.append(error)
         outcomes.append(None)
     bar = _bar(len(outcomes)) if progress_bar else None
-    for done, future in enumerate(as_completed(futures), 1):
-        number = futures[future]
+    for future in as_completed(futures):
+        # A cluster would do again what a worker that dies has done for a
+        # future that somebody still holds.
+        number = futures.pop(future)
         try:
             outcomes[number] = future.result()
         except Exception as error:  # noqa: BLE001 a worker may die of any
@@ -198,7 +225,8 @@ def _collect(pool, work, tasks, progress_bar, keep=None):
         else:
             if keep is not None:
                 keep(number, outcomes[number])
-        tell(done, len(outcomes))
+        del future
+        tell(len(outcomes) - len(futures), len(outcomes))
         if bar is not None:
             _advance(bar, outcomes)
     if bar is not None:

@@ -13,7 +13,7 @@ _HINT = 0.4
 # A further star is looked for within this distance of a known one [pix], with
 # the known one free to move; where less than this fraction of the
 # information is left, the two cannot be told apart.
-_REACH = 2.3
+REACH = 2.3
 LEAST = 0.05
 # No star is added this close to another, or to one that was taken away [pix].
 _SEPARATION = 0.3
@@ -25,13 +25,18 @@ _OUTSIDE = 3.0
 def find(tile, threshold, found_in):
     """Add the maxima of significance on the residual."""
     significance, flux = _scores(tile, threshold)
+    found = peaks(significance, flux, threshold, found_in)[2]
+    tile.admit(found.chosen(apart(found, tile.model.stars, tile.rejected)))
+
+
+def peaks(significance, flux, threshold, found_in):
+    """Return rows and columns of maxima (n,), and the stars there."""
     peak = (significance > threshold) & (
         significance == maximum_filter(significance, 3))
     y, x = np.nonzero(peak)
     dx, dy = _vertex(significance, x, y)
-    found = Stars(x + dx, y + dy, flux[y, x],
-                  significance=significance[y, x], found_in=found_in)
-    tile.admit(found.chosen(_apart(tile, found)))
+    return y, x, Stars(x + dx, y + dy, flux[y, x],
+                       significance=significance[y, x], found_in=found_in)
 
 
 def _scores(tile, threshold):
@@ -49,20 +54,20 @@ def _scores(tile, threshold):
     fit = kernels.Fit(model.stars.sources, model.stamps,
                       model.neighbours.pairs, tile.equations.stars)
     kernels.score_beside(fit, templates, model.planes(light),
-                         kernels.Limits(_REACH, LEAST, float(threshold)),
+                         kernels.Limits(REACH, LEAST, float(threshold)),
                          significance, flux)
     return significance, flux
 
 
-def _apart(tile, found):
-    apart = np.ones(len(found), bool)
+def apart(found, known, rejected):
+    """Tell which stars are away from those known and places (n, 2)."""
+    out = np.ones(len(found), bool)
     positions = np.column_stack([found.x, found.y])
-    known = tile.model.stars
     stars = np.column_stack([known.x, known.y])
-    for places, limit in ((stars, _SEPARATION), (tile.rejected, _REJECTED)):
+    for places, limit in ((stars, _SEPARATION), (rejected, _REJECTED)):
         if len(places) and len(found):
-            apart &= cKDTree(places).query(positions)[0] > limit
-    return apart
+            out &= cKDTree(places).query(positions)[0] > limit
+    return out
 
 
 def leave_out(tile, threshold):
@@ -71,10 +76,20 @@ def leave_out(tile, threshold):
 
     Returns their places (n, 2).
     """
-    s, p = tile.model.stars, tile.model.neighbours
+    s = tile.model.stars
     covariance, _ = tile.equations.covariances()
     with np.errstate(invalid='ignore'):
         strength = s.flux / np.sqrt(covariance[:, 0, 0])
+    weak = weakest(s, tile.model.neighbours, strength, threshold,
+                   tile.model.data.shape)
+    gone = np.flatnonzero(weak)
+    places = np.column_stack([s.x[gone], s.y[gone]])
+    tile.dismiss(weak)
+    return places
+
+
+def weakest(s, p, strength, threshold, shape):
+    """Tell which stars of a strength (n,) are to go, the weakest first."""
     weak = ~(strength >= threshold) & ~s.listed
     near = np.hypot(s.x[p.owner] - s.x[p.neighbour],
                     s.y[p.owner] - s.y[p.neighbour]) < 2
@@ -84,14 +99,10 @@ def leave_out(tile, threshold):
     second = np.zeros(len(s), bool)
     second[p.neighbour[fainter]] = True
     weak &= second | ~np.isnan(strength) | ~(s.flux > 0)
-    ny, nx = tile.model.data.shape
-    weak |= ~s.listed & (np.maximum(
+    ny, nx = shape
+    return weak | (~s.listed & (np.maximum(
         np.maximum(-s.x, s.x - nx + 1),
-        np.maximum(-s.y, s.y - ny + 1)) > _OUTSIDE)
-    gone = np.flatnonzero(weak)
-    places = np.column_stack([s.x[gone], s.y[gone]])
-    tile.dismiss(weak)
-    return places
+        np.maximum(-s.y, s.y - ny + 1)) > _OUTSIDE))
 
 
 def _vertex(image, x, y):

@@ -28,17 +28,18 @@ def solve_tile(job):
         warm_up(tile, job.given)
     else:
         tile.start(saturated_stars(tile.model))
-        _find_all(tile)
+        find_all(tile, find, leave_out)
         if job.given is not None:
-            associate(tile, job.given)
-    _settle(tile)
+            associate(tile, job.given, leave_out)
+    settle(tile, leave_out)
     return tile
 
 
 # What is done does not depend on how many stars there are or move: what
 # happens around a star has to be the same on every tile it is on.
 
-def _find_all(tile):
+def find_all(tile, find, leave_out):
+    """Find and fit stars, the brightest first, with the searches given."""
     options = tile.options
     for number, threshold in enumerate(_FALLING):
         if threshold > options.faintest:
@@ -47,7 +48,7 @@ def _find_all(tile):
             if number == 0:
                 # Later, errors of the PSF are hidden by false companions.
                 tile.step(0.05)
-                tile.note_widths(size_differences(tile.model))
+                tile.note_widths(size_differences)
             leave_out(tile, 1.0)
             tile.update_diffuse()
     for number in range(options.max_rounds):
@@ -61,7 +62,8 @@ def _find_all(tile):
         tile.update_diffuse()
 
 
-def _settle(tile):
+def settle(tile, leave_out):
+    """Let all stars come to rest."""
     tile.polish(_DAMPING, _FIRST_STEPS)
     # Some have faded, or become one with another.
     leave_out(tile, tile.options.keep)

@@ -131,14 +131,16 @@ class Neighbours:
     distance: np.ndarray
 
     @classmethod
-    def of(cls, x, y):
-        """List the pairs of stars that are solved for together."""
-        owner, neighbour, gap = _close_pairs(x, y)
+    def of(cls, x, y, scale=1.0):
+        """
+        List the pairs of stars that are solved for together.
+
+        ``scale`` is the size of a pixel in units of x and y.
+        """
+        owner, neighbour, gap, twin = _close_pairs(
+            x, y, scale * _PAIR_DISTANCE)
         count = np.bincount(owner, minlength=x.size)
         indptr = np.concatenate([[0], np.cumsum(count)])
-        # Ordered by neighbour, then owner, the pairs are their twins.
-        twin = np.empty(owner.size, np.int64)
-        twin[np.lexsort([neighbour, owner])] = np.lexsort([owner, neighbour])
         has = count > 0
         nearest, distance = np.full(x.size, -1), np.full(x.size, np.inf)
         nearest[has] = neighbour[indptr[:-1][has]]
@@ -151,17 +153,23 @@ class Neighbours:
         return kernels.Pairs(self.indptr, self.neighbour, self.twin)
 
 
-def _close_pairs(x, y):
+def _close_pairs(x, y, reach):
     """
-    Return pairs of points within reach of each other, and their distances.
+    Return pairs of points within reach, their distances, and their twins.
 
     Each pair both ways round, ordered by its first point, nearest first.
     """
+    none = np.empty(0, np.int64)
     if x.size < 2:
-        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+        return none, none, np.empty(0), none
     pairs = cKDTree(np.column_stack([x, y])).query_pairs(
-        _PAIR_DISTANCE, output_type='ndarray')
+        reach, output_type='ndarray')
+    n = len(pairs)
     owner, neighbour = np.concatenate([pairs, pairs[:, ::-1]]).T
     gap = np.hypot(x[owner] - x[neighbour], y[owner] - y[neighbour])
     order = np.lexsort([neighbour, gap, owner])
-    return owner[order], neighbour[order], gap[order]
+    place = np.empty(2 * n, np.int64)
+    place[order] = np.arange(2 * n)
+    # The other way round a pair stood n places further on.
+    twin = place[np.where(order < n, order + n, order - n)]
+    return owner[order], neighbour[order], gap[order], twin

@@ -20,9 +20,9 @@ PARTIAL, OUTSIDE, NO_FLUX, NO_CONVERGENCE, NO_COVARIANCE = 1, 2, 4, 8, 16
 AT_BOUND, NO_OVERLAP = 32, 64
 
 # A star that still moved this far in the last step has not converged [pix].
-_STILL = 0.02
+STILL = 0.02
 # Correlation with the nearest neighbour's flux from which a star is a blend.
-_BLEND_CORRELATION = 0.5
+BLEND_CORRELATION = 0.5
 
 # A star is none if what is left in its pixels is many times the noise and no
 # small part of its light.
@@ -60,7 +60,7 @@ def tabulate(tile, core):
     """Return the stars of a solved tile that lie in its core."""
     model, near = tile.model, tile.model.neighbours
     s = model.stars
-    quality = _quality(model)
+    quality = quality_of(model)
     covariance, correlation = tile.equations.covariances()
     hidden = _hidden(tile, covariance)
     covariance = covariance * _misfit(quality)[:, None, None]
@@ -80,15 +80,15 @@ def tabulate(tile, core):
         significance=np.where(s.significance > 0, s.significance, strength),
         crowding=crowding, neighbor_distance=near.distance,
         neighbor_correlation=correlation)
-    table = measured.chosen(_significant(s, tile.options.threshold, strength))
+    table = measured.chosen(significant(s, tile.options.threshold, strength))
     table = Stars.of_columns({name: getattr(table, name)
                               for name, _ in _COLUMNS})
     y_0, x_0 = tile.origin
-    table = _with_repeats(table, tile.repeats).moved(x_0, y_0)
-    return table.chosen(_inside(table, core))
+    table = with_repeats(table, tile.repeats).moved(x_0, y_0)
+    return table.chosen(inside(table, core))
 
 
-def _significant(s, threshold, strength):
+def significant(s, threshold, strength):
     """Tell which stars are to be reported."""
     # A position that is fitted, too, makes noise two degrees of freedom
     # stronger.
@@ -96,7 +96,7 @@ def _significant(s, threshold, strength):
             | (strength >= np.sqrt(threshold**2 + 2)))
 
 
-def _inside(stars, core):
+def inside(stars, core):
     """Tell which stars are reported by the tile of a core."""
     y_low, y_high, x_low, x_high = core
     # A star belongs to the tile whose core its nearest pixel is in, one of a
@@ -104,11 +104,11 @@ def _inside(stars, core):
     listed = stars.listed
     x = np.rint(np.where(listed, stars.x_init, stars.x))
     y = np.rint(np.where(listed, stars.y_init, stars.y))
-    inside = (x >= x_low) & (x < x_high) & (y >= y_low) & (y < y_high)
-    return inside & listed if listed.any() else inside
+    here = (x >= x_low) & (x < x_high) & (y >= y_low) & (y < y_high)
+    return here & listed if listed.any() else here
 
 
-def _with_repeats(stars, repeats):
+def with_repeats(stars, repeats):
     """Add a row for each entry that means the star of another."""
     if not repeats:
         return stars
@@ -121,7 +121,8 @@ def _with_repeats(stars, repeats):
         flags=more.flags | REPEATED)])
 
 
-def _quality(model):
+def quality_of(model):
+    """Return the sums (n, 6) of `~photutils_mgauss.kernels.star_quality`."""
     out = np.empty((len(model.stars), 6))
     kernels.star_quality(model.stars.sources, model.stamps,
                          model.planes(model.star_light()), out)
@@ -173,15 +174,15 @@ def _flags(tile, quality, error, correlation):
             (OUTSIDE, (s.x < -0.5) | (s.y < -0.5) | (s.x > nx - 0.5)
              | (s.y > ny - 0.5)),
             (NO_FLUX, ~(s.flux > 0)),
-            (NO_CONVERGENCE, tile.moved > _STILL),
+            (NO_CONVERGENCE, tile.moved > STILL),
             (AT_BOUND, gone > s.bound - 1e-6),
             (NOT_SEEN, s.listed & ~(s.flux > tile.options.keep
                                     * error[:, 0])),
             (NO_COVARIANCE, ~np.isfinite(error).all(axis=1)),
             (SATURATED, (quality[:, 5] < 0.5) | _is_hidden(tile.model)),
-            (NOT_A_STAR, (smooth_light(tile.model)
-                          | _unlike_a_star(s.flux, quality))),
-            (BLENDED, np.abs(correlation) > _BLEND_CORRELATION)):
+            (NOT_A_STAR, (smooth_light([tile.model])
+                          | unlike_a_star(s.flux, quality))),
+            (BLENDED, np.abs(correlation) > BLEND_CORRELATION)):
         flags[where] |= bit
     return flags
 
@@ -194,7 +195,7 @@ def _is_hidden(model):
         np.clip(np.rint(s.x).astype(int), 0, nx - 1)]
 
 
-def _unlike_a_star(flux, quality):
+def unlike_a_star(flux, quality):
     """Tell under which stars there is something else."""
     count, chi2, deviation = quality[:, :3].T
     return ((chi2 > _BAD_CHI2 * np.maximum(count - 3, 1))

@@ -14,7 +14,7 @@ CELL = 32
 _TEMPLATE_HALF = 3
 # Polishing moves no star further than this [pix]: blends that cannot be
 # resolved would run away.
-_ROAM = 0.5
+ROAM = 0.5
 # A step smaller than this, in pixels and in standard errors, is not taken.
 REST = 2e-5
 
@@ -99,6 +99,21 @@ class Tile:
         self.moved = np.empty(0)
         self.templates = _templates(job.psf, job.data.shape)
 
+    @property
+    def stars(self):
+        """The stars of the model."""
+        return self.model.stars
+
+    @property
+    def neighbours(self):
+        """Who is beside whom."""
+        return self.model.neighbours
+
+    @property
+    def area(self):
+        """The area of the PSF [pix^2]."""
+        return self.model.psf.area
+
     # What follows keeps the equations up to date with the model.
 
     def _form_equations(self):
@@ -129,9 +144,21 @@ class Tile:
         self.model.stars.bind(which, entries)
         self.refresh()
 
-    def brighten(self, which, more):
-        """Let some stars start from a higher flux."""
-        self.model.stars.brighten(which, more)
+    def admit_listed(self, entries, spread):
+        """
+        Add entries without a star, as bright as the residual allows.
+
+        They are held to their places, with a standard deviation ``spread``.
+        """
+        n, model = len(self.stars), self.model
+        least = np.full(len(entries), 0.1 * model.noise
+                        / model.psf.profile[0])
+        self.admit(entries.replaced(flux=least, flux_init=least.copy(),
+                                    hold=np.full(len(entries), spread**-2)))
+        information = self.equations.stars.matrix[n:, 0, 0]
+        more = np.divide(self.equations.stars.gradient[n:, 0], information,
+                         where=information > 0, out=np.zeros(len(entries)))
+        model.stars.brighten(np.s_[n:], np.maximum(more, 0))
         self.refresh()
 
     def _solve(self, damping):
@@ -189,9 +216,9 @@ class Tile:
         self.repeats += zip(entries.number, host, entries.x_init,
                             entries.y_init, strict=True)
 
-    def note_widths(self, widths):
-        """Remember by how much the PSF is too narrow."""
-        self.widths = widths
+    def note_widths(self, measure):
+        """Remember by how much the PSF is too narrow, as measured."""
+        self.widths = measure(self.model)
 
 
 def _templates(psf, shape):
@@ -210,7 +237,7 @@ def _parameters(stars):
 def _trust_region(stars):
     """Return the limits (n, 3) of stars that are being polished."""
     now = _parameters(stars)
-    roam = np.full_like(now, _ROAM)
+    roam = np.full_like(now, ROAM)
     low, high = roam.copy(), roam
     low[:, 0], high[:, 0] = stars.flux / 2, stars.flux
     return now - low, now + high

@@ -225,7 +225,7 @@ def _apply_mesh(v, first, mesh, out):
 
 
 @inner
-def _apply_joint(v, stars, pairs, mesh, out):
+def apply_joint(v, stars, pairs, mesh, out):
     """
     Multiply by the joint normal matrix of stars and background.
 
@@ -317,7 +317,7 @@ def solve_joint(stars, pairs, mesh, tolerance, max_steps, inverse, scratch,
     for count in range(max_steps):
         if not rz > goal:
             return count
-        alpha = rz / _apply_joint(v, stars, pairs, mesh, a)
+        alpha = rz / apply_joint(v, stars, pairs, mesh, a)
         for i in range(step.size):
             step[i] += alpha * v[i]
             r[i] -= alpha * a[i]
@@ -337,7 +337,7 @@ def put_block(blocks, which, row, column, a):
 
 
 @inner
-def _members(i, indptr, neighbour, members):
+def members_of(i, indptr, neighbour, members):
     """Put a star and its first neighbours into members; return how many."""
     members[0] = i
     count = 1
@@ -350,7 +350,7 @@ def _members(i, indptr, neighbour, members):
 
 
 @inner
-def _joint_matrix(members, count, matrix, blocks, indptr, neighbour, where,
+def joint_matrix(members, count, matrix, blocks, indptr, neighbour, where,
                   a):
     """
     Put the normal matrix of some stars into a (3 count, 3 count).
@@ -374,7 +374,7 @@ def _joint_matrix(members, count, matrix, blocks, indptr, neighbour, where,
 
 
 @inner
-def _scale_matrix(a, size, scale):
+def scale_matrix(a, size, scale):
     """Make the diagonal of a matrix 1; scale takes by what rows went."""
     for m in range(size):
         scale[m] = 1 / sqrt(a[m, m]) if a[m, m] > 0 else 0.0
@@ -404,11 +404,11 @@ def joint_covariances(stars, pairs, partner, covariance, correlation):
     a = np.empty((3 * _MOST_FREE, 3 * _MOST_FREE))
     scale, columns = np.empty(3 * _MOST_FREE), np.empty((4, 3 * _MOST_FREE))
     for i in range(n):
-        count = _members(i, indptr, neighbour, members)
+        count = members_of(i, indptr, neighbour, members)
         size = 3 * count
-        _joint_matrix(members, count, matrix, blocks, indptr, neighbour, where,
+        joint_matrix(members, count, matrix, blocks, indptr, neighbour, where,
                       a)
-        _scale_matrix(a, size, scale)
+        scale_matrix(a, size, scale)
         correlation[i] = 0.0
         solved = scale[0] > 0 and cholesky(a, size, 1e-12)
         for r in range(3):

@@ -10,7 +10,7 @@ from photutils_mgauss.kernels.linear import cholesky
 
 # So many stars around a pixel are free to readjust when a further one is
 # looked for there, those within this distance [pix].
-_MOST_FREE = 4
+MOST_BESIDE = 4
 _FREE_DISTANCE = 3.0
 
 
@@ -55,7 +55,7 @@ class Limits(NamedTuple):
     threshold: float
 
 
-class _Scratch(NamedTuple):
+class Scratch(NamedTuple):
     """Stars around a pixel, their factors, two right sides, and sums."""
 
     members: np.ndarray
@@ -112,7 +112,7 @@ def score(residual, weight, template, x_low, x_high, y_low, y_high, hint,
 
 
 @inner
-def _template_products(x, y, template, weight, residual, light, out):
+def template_products(x, y, template, weight, residual, light, out):
     """
     Put the sums of t w r, t^2 w and (t w light)^2 around a pixel into out.
 
@@ -163,7 +163,7 @@ def _template_overlap(x, y, template, weight, left, bottom, width, offset,
 
 
 @inner
-def _stars_around(column, row, i, x, y, indptr, neighbour, members):
+def stars_around(column, row, i, x, y, indptr, neighbour, members):
     """
     Put the stars around a pixel into members; return how many.
 
@@ -238,7 +238,7 @@ def _readjust(size, a, right, sums):
 
 
 @inner
-def _score_pixel(x, y, count, fit, template, weight, least, scratch):
+def score_pixel(x, y, count, fit, template, weight, least, scratch):
     """Return significance and flux of a star at a pixel, or zeros."""
     members, a, right, sums = scratch
     left, bottom, width, offset, derivatives = fit.stamps
@@ -284,9 +284,9 @@ def score_beside(fit, templates, planes, limits, significance, flux):
     weight, residual, light = planes
     stamps, cell = templates
     reach, least, threshold = limits
-    size = 3 * _MOST_FREE
-    members, sums = np.empty(_MOST_FREE, np.int64), np.empty(3)
-    scratch = _Scratch(members, np.empty((size, size)), np.empty((size, 2)),
+    size = 3 * MOST_BESIDE
+    members, sums = np.empty(MOST_BESIDE, np.int64), np.empty(3)
+    scratch = Scratch(members, np.empty((size, size)), np.empty((size, 2)),
                        sums)
     side = int(ceil(reach))
     for i in range(px.size):
@@ -296,17 +296,17 @@ def score_beside(fit, templates, planes, limits, significance, flux):
                            min(nx, column + side + 1)):
                 if (px[i] - x)**2 + (py[i] - y)**2 > reach * reach:
                     continue
-                count = _stars_around(x, y, i, px, py, indptr, neighbour,
+                count = stars_around(x, y, i, px, py, indptr, neighbour,
                                       members)
                 if count == 0:
                     continue
                 significance[y, x] = 0.0
                 template = stamps[y // cell, x // cell]
                 # What the stars' freedom can add is bounded.
-                if _template_products(
+                if template_products(
                         x, y, template, weight, residual, light, sums) and (
                         sums[0] > threshold * sqrt(0.3 * least * sums[1])):
-                    strength, brightness = _score_pixel(
+                    strength, brightness = score_pixel(
                         x, y, count, fit, template, weight, least, scratch)
                     if brightness != 0:
                         significance[y, x] = strength

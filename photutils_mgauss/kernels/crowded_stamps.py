@@ -88,6 +88,23 @@ def star_stamps(chosen, sources, stamps, gaussians):
                     derivatives[2, to + k] = tile[at + 2 * LANES]
 
 
+@kernel
+def turn_stamps(chosen, stamps, slopes):
+    """
+    Make derivatives by other coordinates of those by x and y.
+
+    slopes (n, 2, 2) are the derivatives of each star's x and y by them.
+    """
+    _, _, width, offset, derivatives = stamps
+    for i in chosen:
+        a, b = slopes[i, 0, 0], slopes[i, 0, 1]
+        c, d = slopes[i, 1, 0], slopes[i, 1, 1]
+        for at in range(offset[i], offset[i] + width[i] * width[i]):
+            by_x, by_y = derivatives[1, at], derivatives[2, at]
+            derivatives[1, at] = a * by_x + c * by_y
+            derivatives[2, at] = b * by_x + d * by_y
+
+
 @inner
 def _walk_rows(start, end, way, fall, first, g, r, image):
     """Add g (n,) to rows start, start + way, ... end of image, r its fall."""

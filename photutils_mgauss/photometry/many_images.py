@@ -13,6 +13,8 @@ each image are fitted to all their pixels together. With the Jacobian
 so nothing is lost that averaging catalogues would lose, and an image too
 shallow to show the star by itself helps, too.
 """
+from dataclasses import dataclass
+
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
@@ -33,7 +35,12 @@ from photutils_mgauss.photometry.joint_pixels import (
     covariances,
 )
 from photutils_mgauss.sky.observers import add_aberration
-from photutils_mgauss.sky.tangent_plane import TangentPlane, directions
+from photutils_mgauss.sky.pixel_grid import PixelGrid
+from photutils_mgauss.sky.tangent_plane import (
+    TangentPlane,
+    directions,
+    unit_vectors,
+)
 from photutils_mgauss.sky.wcs import (
     check_celestial,
     invert_wcs,
@@ -427,6 +434,120 @@ def _table(state, converged, plane, scale, unit, weighted):
     table['reduced_chi2'] = scatter if weighted else np.nan
     table['converged'] = converged
     return table
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """
+    Many images of one field, read.
+
+    ``pixels`` are `PixelData` with errors, ``psfs`` models of fixed shape or
+    None, ``grid`` is the `~photutils_mgauss.sky.pixel_grid.PixelGrid` that
+    all have in common, ``years`` (E,) are the times, or None where images
+    come without.
+    """
+
+    pixels: list
+    psfs: list
+    unit: object
+    grid: PixelGrid
+    years: np.ndarray | None
+
+    def time_since_mean(self):
+        """Return how long after the mean time images were taken (E,) [yr]."""
+        if self.years is None or np.ptp(self.years) == 0:
+            msg = ('images must be ImageEpoch of two times at least for '
+                   'motions=True, got '
+                   f'{"no times" if self.years is None else "one time"}')
+            raise ValueError(msg)
+        return self.years - self.years.mean()
+
+
+def read_field(images):
+    """
+    Read images of one field, (data, psf, wcs) or ImageEpoch.
+
+    Returns
+    -------
+    Field
+
+    Raises
+    ------
+    TypeError, ValueError
+        If something is wrong with them.
+    """
+    images = list(images)
+    if not images:
+        msg = 'images must have at least one element, got none'
+        raise ValueError(msg)
+    pixels, psfs, frames = zip(*map(_read_any, images), strict=True)
+    units = [one.unit for one in pixels]
+    if any(unit != units[0] for unit in units):
+        msg = f'images must have one unit, got {units}'
+        raise ValueError(msg)
+    grid = PixelGrid.of(frames, [one.shape for one in pixels])
+    years = [getattr(one, 'year', None) for one in images]
+    return Field([one.with_error() for one in pixels], list(psfs), units[0],
+                 grid, None if None in years else np.array(years))
+
+
+def _read_any(entry):
+    """Return pixels, PSF or None, and WCS of one image of a field."""
+    if hasattr(entry, 'pixels') and hasattr(entry, 'wcs'):
+        if entry.velocity is not None:
+            msg = ('images must come without observer, got '
+                   f'{entry.observer!r:.80}: aberration is not known here')
+            raise ValueError(msg)
+        return entry.pixels, entry.model, entry.wcs
+    if not isinstance(entry, (tuple, list)) or len(entry) != 3:
+        msg = ('images must hold (data, psf, wcs) or ImageEpoch, got '
+               f'{entry!r:.80}')
+        raise TypeError(msg)
+    data, psf, wcs = entry
+    check_celestial(wcs)
+    return (read_pixels(data, name='data of images'),
+            None if psf is None else fixed_psf(psf), wcs)
+
+
+def grid_positions(stars, grid):
+    """Return columns and rows (2, n) of a table with ra, dec or SkyCoord."""
+    if isinstance(stars, SkyCoord):
+        place = stars.reshape(-1).icrs
+        ra, dec = place.ra.deg, place.dec.deg
+    else:
+        check_table(stars, 'stars', ('dec', 'ra'))
+        ra, dec = (column_values(stars, name, u.deg)
+                   for name in ('ra', 'dec'))
+    return grid.positions(unit_vectors(ra, dec))
+
+
+def add_places(table, grid, columns, rows, covariance):
+    """Add positions on a grid (n,), of some covariance (n, 2, 2) [pix^2]."""
+    vectors = grid.vectors(columns, rows)
+    _add_columns(table, vectors, grid.plane, _turn(covariance[:, :2, :2],
+                                                   grid.matrix))
+
+
+def add_motions(table, grid, columns, rows, covariance, rates, year):
+    """
+    Add proper motions of stars at positions of a grid.
+
+    ``covariance`` (n, 4, 4) is that of positions and ``rates`` (n, 2)
+    [pix / yr]; NaN where these are not known.
+    """
+    local = np.moveaxis(grid.plane.local_inverse(grid.plane.project(
+        grid.vectors(columns, rows))), -1, 0) @ grid.matrix
+    motion = np.einsum('nij,nj->ni', local, rates)
+    spread = _turn(covariance[:, 2:, 2:], local)
+    known = np.isfinite(motion).all(axis=1)
+    for i, name in enumerate(('pmra', 'pmdec')):
+        table[name] = motion[:, i] * u.mas / u.yr
+        table[f'{name}_error'] = np.where(known, np.sqrt(
+            spread[:, i, i]), np.nan) * u.mas / u.yr
+    table['pmra_pmdec_corr'] = np.where(known, spread[:, 0, 1] / np.sqrt(
+        spread[:, 0, 0] * spread[:, 1, 1]), np.nan)
+    table['ref_epoch'] = np.full(len(table), year) * u.yr
+    table.meta['TIMESYS'] = 'TDB'
 
 
 def _read_image(entry):

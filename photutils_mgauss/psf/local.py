@@ -151,10 +151,23 @@ class LocalPSF:
 
     def stamp(self, x, y, half):
         """Draw a star of unit flux in the middle of a stamp."""
-        rows, count = self.rows_at(np.array([float(x)]), np.array([float(y)]))
-        out = np.zeros((2 * half + 1, 2 * half + 1))
-        kernels.render(rows[0, :count[0]], float(half), float(half), 1.0,
-                       self.integrated, out)
+        place = (np.array([float(one)]) for one in (x, y))
+        return self.stamps(*place, half, [(0, 0)])[0, 0]
+
+    def stamps(self, x, y, half, shifts):
+        """
+        Draw stars of unit flux at places (n,), in the middle of stamps.
+
+        Each is drawn anew shifted by each of m (x, y) tuples. The outcome is
+        (n, m, 2 half + 1, 2 half + 1).
+        """
+        rows, count = self.rows_at(x, y)
+        side = 2 * half + 1
+        out = np.zeros((x.size, len(shifts), side, side))
+        for i, n in enumerate(count):
+            for (dx, dy), stamp in zip(shifts, out[i], strict=True):
+                kernels.render(rows[i, :n], half + float(dx),
+                               half + float(dy), 1.0, self.integrated, stamp)
         return out
 
 

@@ -466,3 +466,27 @@ def test_help_comes_without_loading_what_computes():
     loaded = subprocess.run([sys.executable, '-c', code], check=True,
                             capture_output=True, text=True).stdout.split()
     assert not {'numpy', 'astropy', 'photutils', 'numba'} & set(loaded)
+
+
+def test_images_of_one_field_are_measured_together(chain, monkeypatch):
+    monkeypatch.chdir(chain)
+    assert main(['photometry', 'images/night1.fits', 'images/night2.fits',
+                 '--psf', 'night1_psf.fits', 'night2_psf.fits', '--crowded',
+                 '--together', '--output', 'both.fits', '--quiet']) == 0
+    table = QTable.read(chain / 'both.fits')
+    assert json.loads(table.meta['MGRUN'])['options']['together'] is True
+    assert table['flux'].shape == (len(table), 2)
+    alone = QTable.read(chain / 'crowded.fits')
+    assert len(table) > 0.9 * len(alone)
+
+
+@pytest.mark.parametrize(('options', 'words'), [
+    (['--together'], 'with --crowded'),
+    (['--together', '--crowded', '--magnitudes'], 'without --magnitudes'),
+    (['--together', '--crowded', '--output', 'folder'], 'must be a file')])
+def test_what_does_not_go_together_is_told(chain, monkeypatch, capsys,
+                                           options, words):
+    monkeypatch.chdir(chain)
+    assert main(['photometry', 'images/night1.fits', '--psf',
+                 'night1_psf.fits', *options]) != 0
+    assert words in capsys.readouterr().err

@@ -1,0 +1,102 @@
+"""The stars of one crowded field in many images: from images to the table."""
+from dataclasses import replace
+
+import numpy as np
+
+from photutils_mgauss.crowded.many_equations import FARTHEST, reach_of
+from photutils_mgauss.crowded.many_plan import ManyPlan
+from photutils_mgauss.crowded.many_table import as_qtable, no_stars
+from photutils_mgauss.crowded.plan import run
+from photutils_mgauss.crowded.stars import Stars
+from photutils_mgauss.crowded.table import NO_COVARIANCE, NO_OVERLAP
+from photutils_mgauss.photometry.many_images import (
+    add_motions,
+    add_places,
+    grid_positions,
+    read_field,
+)
+from photutils_mgauss.psf.local import LocalPSF
+from photutils_mgauss.utils.checkpoint import Checkpoint
+
+
+def fit_images(photometry, images, listed, *, motions):
+    """
+    Return the table of all images, what is unfinished, and errors.
+
+    Parameters
+    ----------
+    photometry : CrowdedMixturePhotometry
+        Whose settings are used.
+    images, listed, motions
+        As of its method `fit_images`.
+    """
+    field = read_field(images)
+    given = None
+    if listed is not None:
+        u, v = grid_positions(listed, field.grid)
+        given = Stars(u, v, np.zeros(u.size), number=np.arange(u.size),
+                      bound=photometry.bound)
+    each = [photometry.options_of(one) for one in field.pixels]
+    plan = ManyPlan(
+        field.pixels, _psfs(photometry, field),
+        # What is known of fluxes and places is said once for all images.
+        [replace(one, count_slope=0.0) for one in each],
+        replace(each[0], gain=None), field.grid,
+        np.ones(len(each)), _factors(field, motions), photometry.tile_shape,
+        photometry.overlap, given,
+        Checkpoint(photometry.checkpoint)).with_scales()
+    outcomes, errors = run(plan, photometry.executor, photometry.progress_bar)
+    left = [core for core, outcome in zip(plan.cores, outcomes, strict=True)
+            if outcome is None]
+    return _table(plan, outcomes, field), left, errors
+
+
+def _factors(field, motions):
+    """Return how images see places and, if asked for, motions (E, 2, p)."""
+    factors = np.tile(np.eye(2), (len(field.pixels), 1, 2 if motions else 1))
+    if motions:
+        factors[:, :, 2:] *= field.time_since_mean()[:, None, None]
+    return factors
+
+
+def _psfs(photometry, field):
+    return [LocalPSF.of(photometry.model_of(pixels) if psf is None else psf)
+            for psf, pixels in zip(field.psfs, field.pixels, strict=True)]
+
+
+def _table(plan, outcomes, field):
+    done = [outcome for outcome in outcomes if outcome is not None]
+    stars = Stars.joined([no_stars(len(plan.images),
+                                   plan.factors.shape[2]),
+                          *(outcome.stars for outcome in done)])
+    n_pixels = sum(outcome.n_pixels for outcome in done)
+    meta = {'n_stars': len(stars), 'scales': plan.scales,
+            'reduced_chi2': sum(one.chi2 for one in done) / max(n_pixels, 1)}
+    if plan.given is not None:
+        stars = _in_given_order(stars, plan.given)
+    else:
+        stars.sort('y', 'x')
+    place = stars.x, stars.y, stars.place
+    # Of what is not seen only what was taken before comes out.
+    reach = reach_of(plan.factors)[2:]
+    spread = np.sqrt(np.einsum('nii->ni', stars.place[:, 2:, 2:]))
+    rate = np.where(spread * reach < FARTHEST / 2, stars.rate, np.nan)
+    table = as_qtable(stars, field.unit, meta)
+    add_places(table, plan.grid, *place)
+    if plan.factors.shape[2] > 2:
+        add_motions(table, plan.grid, *place, rate, field.years.mean())
+    return table
+
+
+def _in_given_order(stars, given):
+    """Return one row for each place; NaN where nothing was fitted."""
+    columns = {}
+    for name, column in vars(stars).items():
+        fill = np.nan if column.dtype.kind == 'f' else 0
+        columns[name] = np.full((len(given), *column.shape[1:]), fill,
+                                column.dtype)
+        columns[name][stars.number] = column
+    missing = np.ones(len(given), bool)
+    missing[stars.number] = False
+    columns['flags'][missing] |= NO_COVARIANCE | NO_OVERLAP
+    return Stars.of_columns(columns)

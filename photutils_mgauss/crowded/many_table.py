@@ -1,0 +1,158 @@
+"""What is reported of each star of a crowded field seen in many images."""
+import astropy.units as u
+import numpy as np
+from astropy.table import QTable
+
+from photutils_mgauss.crowded.judge import smooth_light
+from photutils_mgauss.crowded.many_search import strength_of
+from photutils_mgauss.crowded.stars import Stars
+from photutils_mgauss.crowded.table import (
+    AT_BOUND,
+    BLEND_CORRELATION,
+    NO_CONVERGENCE,
+    NO_COVARIANCE,
+    NO_FLUX,
+    STILL,
+    inside,
+    quality_of,
+    significant,
+    unlike_a_star,
+    with_repeats,
+)
+from photutils_mgauss.utils.flags import (
+    BLENDED,
+    NOT_A_STAR,
+    NOT_SEEN,
+    SATURATED,
+)
+
+# The columns of a star, and those it has once for each image.
+_COLUMNS = ('number', 'x', 'y', 'x_init', 'y_init', 'rate', 'place',
+            'significance', 'n_images', 'reduced_chi2', 'flags',
+            'neighbor_distance', 'neighbor_correlation', 'found_in')
+_WHOLE = ('number', 'n_images', 'flags', 'found_in')
+_EACH = ('x_image', 'y_image', 'fluxes', 'flux_err', 'local_bkg',
+         'n_pixels_fit', 'image_chi2', 'crowding')
+_COUNTS = ('n_pixels_fit',)
+
+
+def no_stars(n_images, p):
+    """Return what `tabulate` does of a tile without stars."""
+    columns = {name: np.empty(0, int if name in _WHOLE else float)
+               for name in _COLUMNS}
+    columns['rate'] = np.empty((0, p - 2))
+    columns['place'] = np.empty((0, p, p))
+    columns.update({name: np.empty((0, n_images), int if name in _COUNTS
+                                   else float) for name in _EACH})
+    return Stars.of_columns(columns)
+
+
+def tabulate(tile):
+    """Return the stars of a solved `ManyTile` that lie in its core."""
+    s, near = tile.stars, tile.neighbours
+    quality = [quality_of(model) for model in tile.models]
+    place, variance, correlation = tile.equations.covariances()
+    factor = np.array([_unseen(one) for one in quality])
+    count, chi2 = (np.array([one[:, i] for one in quality]) for i in (0, 1))
+    informed = np.nan_to_num(tile.fluxes**2 / variance)
+    place = place * _mean(factor, informed)[:, None, None]
+    variance = np.where(count > 0, variance * factor, np.nan)
+    strength, _ = strength_of(tile, variance)
+    strength = np.nan_to_num(strength)
+    shown = count > 0
+    best = np.argmax(np.abs(correlation), axis=0), np.arange(len(s))
+    table = s.replaced(
+        place=place, n_images=shown.sum(axis=0),
+        significance=np.where(s.significance > 0, s.significance, strength),
+        reduced_chi2=chi2.sum(axis=0) / np.maximum(
+            (count - 1).clip(0).sum(axis=0) - 2, 1),
+        flags=_flags(tile, quality, place, strength, correlation[best]),
+        neighbor_distance=near.distance,
+        neighbor_correlation=correlation[best],
+        **_each(tile, quality, variance))
+    table = table.chosen(significant(s, tile.options.threshold, strength))
+    table = Stars.of_columns({name: getattr(table, name)
+                              for name in (*_COLUMNS, *_EACH)})
+    v_0, u_0 = tile.origin
+    table = with_repeats(table, tile.repeats).moved(u_0, v_0)
+    return table.chosen(inside(table, tile.job.core))
+
+
+def _unseen(quality):
+    """
+    Return the factor of the variance for light that is in no star's model.
+
+    What is left of stars that were not found raises the chi2 of a stamp.
+    """
+    count, chi2 = quality[:, 0], quality[:, 1]
+    # Each star has taken about three degrees of freedom from its stamp; six
+    # pixels' worth of prior keeps small numbers from swinging.
+    return np.maximum((chi2 + 6) / np.maximum(count + 3, 6), 1.0)
+
+
+def _mean(values, weights):
+    total = weights.sum(axis=0)
+    return np.divide((values * weights).sum(axis=0), total,
+                     where=total > 0, out=np.ones(total.size))
+
+
+def _each(tile, quality, variance):
+    """Return the columns (n, E) of all images, NaN where they show nothing."""
+    n, job = len(tile.stars), tile.job
+    out = {name: np.full((n, job.n_images), np.nan) for name in _EACH}
+    out['n_pixels_fit'] = np.zeros((n, job.n_images), int)
+    for k, (model, one) in enumerate(zip(tile.models, quality, strict=True)):
+        stars, seen = model.stars, one[:, 0] > 0
+        row, column = job.parts[k].origin
+        for name, values in (
+                ('x_image', stars.x + column), ('y_image', stars.y + row),
+                ('fluxes', stars.flux), ('flux_err', np.sqrt(variance[k])),
+                ('local_bkg', model.background_at(stars.x, stars.y)),
+                ('n_pixels_fit', one[:, 0].astype(int)),
+                ('image_chi2', one[:, 1] / np.maximum(one[:, 0] - 3, 1)),
+                ('crowding', one[:, 4])):
+            out[name][seen, job.images[k]] = values[seen]
+    return out
+
+
+def _flags(tile, quality, place, strength, correlation):
+    s = tile.stars
+    flags = np.zeros(len(s), int)
+    gone = np.abs(s.drift).max(axis=0)
+    shown = np.array([one[:, 0] > 0 for one in quality])
+    lost = np.array([one[:, 5] < 0.5 for one in quality])
+    strange = np.array([
+        unlike_a_star(np.maximum(flux, 0), one) for flux, one in zip(
+            tile.fluxes, quality, strict=True)])
+    for bit, where in (
+            (NO_FLUX, ~(s.flux > 0)),
+            (NO_CONVERGENCE, tile.moved > STILL),
+            (AT_BOUND, gone > s.bound - 1e-6),
+            (NOT_SEEN, s.listed & ~(strength > tile.options.keep)),
+            (NO_COVARIANCE, ~np.isfinite(place[:, 0, 0])),
+            (SATURATED, (lost | ~shown).all(axis=0)),
+            # One image cannot tell of a star that is faint there.
+            (NOT_A_STAR, smooth_light(tile.models)
+             | ((strange | ~shown).all(axis=0) & shown.any(axis=0))),
+            (BLENDED, np.abs(correlation) > BLEND_CORRELATION)):
+        flags[where] |= bit
+    return flags
+
+
+def as_qtable(stars, unit, meta):
+    """Return the stars as a table; empties what is given."""
+    columns = vars(stars)
+    n = columns['x'].size
+    light = 1 if unit is None else unit
+    out = QTable({'id': np.arange(1, n + 1)}, meta=meta)
+    out['x_fit'] = columns.pop('x_image') * u.pix
+    out['y_fit'] = columns.pop('y_image') * u.pix
+    out['flux'] = columns.pop('fluxes') * light
+    for name in ('flux_err', 'local_bkg'):
+        out[name] = columns.pop(name) * light
+    for name in ('n_images', 'n_pixels_fit', 'significance', 'reduced_chi2',
+                 'image_chi2', 'flags', 'crowding', 'neighbor_distance',
+                 'neighbor_correlation'):
+        out[name] = columns.pop(name)
+    out['iter_detected'] = columns.pop('found_in')
+    return out

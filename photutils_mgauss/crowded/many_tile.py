@@ -1,0 +1,362 @@
+"""
+One tile of a crowded field while it is being solved in many images.
+
+Each image has a `SharedModel` of its own, with the stars of all: star i is
+the same in every one of them. Where a star is, is said once, in columns and
+rows of a grid on the sky; the fluxes are those of the images.
+"""
+from dataclasses import dataclass
+
+import numpy as np
+
+from photutils_mgauss import kernels
+from photutils_mgauss.crowded.many_equations import (
+    ManyEquations,
+    reach_of,
+)
+from photutils_mgauss.crowded.model import Model
+from photutils_mgauss.crowded.stars import Neighbours, Stars
+from photutils_mgauss.crowded.tile import CELL, REST, ROAM, TileOptions
+
+# Templates are drawn for so many parts of a pixel along each axis.
+_PHASES = 4
+_TEMPLATE_HALF = 3
+# Stars this far outside of an image are not in it [pix].
+_OUTSIDE = 3.0
+# Fluxes may always change by so many standard errors: they may be negative.
+_FREE = 3.0
+
+
+@dataclass(frozen=True)
+class TileMap:
+    """
+    From columns and rows of a tile's grid to pixels of a tile's image.
+
+    ``whole`` and ``inverse`` are the maps of whole images, ``grid`` (u, v)
+    and ``image`` (x, y) where in them the tile begins.
+    """
+
+    whole: object
+    inverse: object
+    grid: tuple
+    image: tuple
+
+    def __call__(self, u, v):
+        """Return x and y (2, n)."""
+        return self.whole(u + self.grid[0], v + self.grid[1]) - np.array(
+            self.image)[:, None]
+
+    def back(self, x, y):
+        """Return u and v (2, n)."""
+        return self.inverse(x + self.image[0], y + self.image[1]) - np.array(
+            self.grid)[:, None]
+
+    def slopes(self, u, v):
+        """Return the derivatives (n, 2, 2)."""
+        return self.whole.slopes(u + self.grid[0], v + self.grid[1])
+
+    def points(self, shape):
+        """Return where all points (rows, columns) of the grid are."""
+        v, u = (np.arange(n) + first for n, first in zip(
+            shape, self.grid[::-1], strict=True))
+        x, y = self.whole.on_grid(u, v)
+        return kernels.Points(x - self.image[0], y - self.image[1])
+
+
+@dataclass(frozen=True)
+class ManyJob:
+    """
+    A piece of the sky with its margin, and the pieces of images that show it.
+
+    ``parts`` are the `TileJob` of those images, ``images`` their numbers and
+    ``scales`` their relative throughput, ``factors`` (E, 2, p) how they see
+    what places are made of: column and row, and what moves stars. ``shape``
+    and ``origin`` (rows first) are those of the piece on the grid, ``core``
+    (v_low, v_high, u_low, u_high) what of it is reported; ``n_images`` is the
+    number of all images, ``given`` are the stars of a list, in columns and
+    rows of the piece.
+    """
+
+    parts: list
+    maps: list
+    images: np.ndarray
+    scales: np.ndarray
+    factors: np.ndarray
+    options: TileOptions
+    shape: tuple
+    origin: tuple
+    core: tuple
+    n_images: int
+    given: Stars | None = None
+
+    @property
+    def is_empty(self):
+        """Whether there is nothing to fit."""
+        return not any((part.variance > 0).any() for part in self.parts) or (
+            self.given is not None and len(self.given) == 0)
+
+
+class SharedModel(Model):
+    """A `Model` whose stars and neighbours are those of many images."""
+
+    def __init__(self, job):
+        self.slopes = np.empty((0, 2, 2))
+        super().__init__(job)
+        self.neighbours = Neighbours.of(np.empty(0), np.empty(0))
+
+    def _connect(self):
+        """Leave the list of neighbours as the tile has made it."""
+
+    def _draw_stamps(self, chosen):
+        super()._draw_stamps(chosen)
+        kernels.turn_stamps(chosen, self.stamps, self.slopes)
+
+
+class ManyTile:
+    """
+    The models of all images of a `ManyJob`, their equations, and the stars.
+
+    Attributes
+    ----------
+    models : list of SharedModel
+    stars : Stars
+        In columns and rows of the grid; fluxes are those of an image of scale
+        one, made of all images. One more column, ``rate`` (n, p - 2), is what
+        moves them.
+    equations : ManyEquations
+    points : list of kernels.Points
+    phases : list of kernels.Phases
+    rejected, repeats, widths, moved
+        As of `Tile`; ``widths`` are those of each image.
+    """
+
+    def __init__(self, job):
+        self.job, self.options = job, job.options
+        self.origin, self.shape = job.origin, job.shape
+        self.scales = job.scales[:, None]
+        self.models = [SharedModel(part) for part in job.parts]
+        self.points = [one.points(job.shape) for one in job.maps]
+        self.phases = [phases(part.psf, part.data.shape)
+                       for part in job.parts]
+        self.rejected, self.repeats = np.empty((0, 2)), []
+        self.widths = [np.empty(0)] * len(job.parts)
+        self.moved = np.empty(0)
+        self.stars = self._at_rest(Stars([], [], []))
+        # Pixels of the grid may be smaller than those of some images.
+        middle = [np.array([n / 2]) for n in job.shape[::-1]]
+        self.pixels = [float(np.linalg.norm(np.linalg.inv(
+            one.slopes(*middle)[0]), 2)) for one in job.maps]
+
+    @property
+    def fluxes(self):
+        """The fluxes (E, n)."""
+        return np.array([model.stars.flux for model in self.models])
+
+    @property
+    def area(self):
+        """The area of the sharpest PSF in pixels of the grid."""
+        return min(model.psf.area * size**2 for model, size in zip(
+            self.models, self.pixels, strict=True))
+
+    def _at_rest(self, stars):
+        """Return stars with a column for what moves them."""
+        return stars.replaced(rate=np.zeros((
+            len(stars), self.job.factors.shape[2] - 2)))
+
+    def _places(self):
+        """Return what places are made of (n, p)."""
+        return np.column_stack([self.stars.x, self.stars.y, self.stars.rate])
+
+    # What follows keeps models and equations up to date with the stars.
+
+    def _form_equations(self):
+        self.equations = ManyEquations.of(self)
+        light, known = self.equations.summed(self.fluxes)
+        self.stars.flux = np.divide(light, known, where=known > 0,
+                                    out=np.zeros(known.size))
+
+    def _connect(self, stars, slopes):
+        """Take over stars of slopes (E, n, 2, 2); find who is beside whom."""
+        self.stars = stars
+        self.neighbours = Neighbours.of(stars.x, stars.y, max(self.pixels))
+        for model, own in zip(self.models, slopes, strict=True):
+            model.neighbours = self.neighbours
+            model.slopes = own
+
+    def _slopes(self, stars):
+        """Return how places in images change with those of stars."""
+        return [one.slopes(stars.x, stars.y) for one in self.job.maps]
+
+    def _seen(self, stars, fluxes):
+        """Return stars as each image has them."""
+        out = []
+        for model, one, factor, flux in zip(
+                self.models, self.job.maps, self.job.factors, fluxes,
+                strict=True):
+            shift = stars.rate @ factor[:, 2:].T
+            x, y = one(stars.x + shift[:, 0], stars.y + shift[:, 1])
+            ny, nx = model.data.shape
+            away = np.maximum(np.maximum(-x, x - nx + 1),
+                              np.maximum(-y, y - ny + 1)) > _OUTSIDE
+            out.append(Stars(x, y, np.where(away, 0, flux),
+                             seeded=stars.seeded & ~away,
+                             core=stars.core))
+        return out
+
+    def start(self, stars, fluxes):
+        """Put stars, of fluxes (E, n), in place of all others."""
+        stars = self._at_rest(stars)
+        self._connect(stars, self._slopes(stars))
+        for model, own in zip(self.models, self._seen(stars, fluxes),
+                              strict=True):
+            model.start(own)
+        self._form_equations()
+
+    def refresh(self):
+        """Bring everything up to date with the stars."""
+        own = self._seen(self.stars, self.fluxes)
+        self._connect(self.stars, self._slopes(self.stars))
+        for model, stars in zip(self.models, own, strict=True):
+            model.stars.x, model.stars.y = stars.x, stars.y
+            model.refresh()
+        self._form_equations()
+
+    def admit(self, found, fluxes):
+        """Add stars of fluxes (E, n); the others stay as they are."""
+        found = self._at_rest(found)
+        self._connect(Stars.joined([self.stars, found]), [
+            np.concatenate([model.slopes, new]) for model, new in zip(
+                self.models, self._slopes(found), strict=True)])
+        for model, own in zip(self.models, self._seen(found, fluxes),
+                              strict=True):
+            model.admit(own)
+        self._form_equations()
+
+    def admit_listed(self, entries, spread):
+        """
+        Add entries without a star, with what the residuals say of fluxes.
+
+        They are held to their places, with a standard deviation ``spread``.
+        """
+        n = len(self.stars)
+        self.admit(entries.replaced(hold=np.full(len(entries), spread**-2)),
+                   np.zeros((len(self.models), len(entries))))
+        self.brighten(n)
+
+    def brighten(self, first):
+        """Give stars from the first on the fluxes that residuals hold."""
+        for model, one in zip(self.models, self.equations.each, strict=True):
+            known = one.stars.matrix[first:, 0, 0]
+            model.stars.flux[first:] += np.divide(
+                one.stars.gradient[first:, 0], known, where=known > 0,
+                out=np.zeros(known.size))
+        self.refresh()
+
+    def bind(self, which, entries):
+        """Give some stars to entries of a list, within their bounds."""
+        self.stars.bind(which, entries)
+        self.refresh()
+
+    def dismiss(self, gone):
+        """Take stars away; the others stay as they are."""
+        for model in self.models:
+            model.dismiss(gone)
+        self._connect(self.stars.chosen(~gone),
+                      [model.slopes[~gone] for model in self.models])
+        self._form_equations()
+
+    def update_diffuse(self):
+        """Find the diffuse light of each image again."""
+        for model in self.models:
+            model.update_diffuse()
+        self._form_equations()
+
+    def step(self, damping=0.0, moving=slice(None)):
+        """Take one Gauss-Newton step, of all stars or only some."""
+        light, place, levels = self.equations.solve(damping)
+        light, place = self.equations.limited(light, place, self)
+        kept_light, kept_place = np.zeros_like(light), np.zeros_like(place)
+        kept_light[:, moving], kept_place[moving] = (light[:, moving],
+                                                     place[moving])
+        self._move(kept_place)
+        for model, flux, level in zip(self.models, kept_light, levels,
+                                      strict=True):
+            model.take(_step(flux, np.zeros((flux.size, 2))), level)
+        self.refresh()
+
+    def _move(self, place):
+        self.stars.x = self.stars.x + place[:, 0]
+        self.stars.y = self.stars.y + place[:, 1]
+        self.stars.rate = self.stars.rate + place[:, 2:]
+
+    def polish(self, damping, n_steps):
+        """Take steps without a new layout, until all stars are at rest."""
+        self.refresh()
+        region = self._trust_region()
+        self.moved = np.zeros(len(self.stars))
+        for _ in range(n_steps):
+            self._polish_once(damping, region)
+            if not (self.moved > REST).any():
+                break
+
+    def _trust_region(self):
+        """Return limits (2, E, n) of fluxes and (2, n, p) of places."""
+        flux = self.fluxes
+        roam = _FREE * self.equations.flux_errors()
+        place = self._places()
+        reach = np.minimum(ROAM, self.stars.bound)[:, None] / reach_of(
+            self.job.factors)
+        return (np.stack([np.minimum(flux / 2, flux - roam),
+                          np.maximum(2 * flux, flux + roam)]),
+                np.stack([place - reach, place + reach]))
+
+    def _polish_once(self, damping, region):
+        light, place, levels = self.equations.solve(damping)
+        self.moved = np.abs(place * reach_of(self.job.factors)).max(
+            axis=1, initial=0)
+        flux, here = self.fluxes, self._places()
+        light = np.clip(flux + light, *region[0]) - flux
+        place = np.clip(here + place, *region[1]) - here
+        place[self.moved <= REST] = 0
+        self._move(place)
+        restless = (np.abs(light) > REST * self.equations.flux_errors()) | (
+            self.moved > REST)
+        for k, model in enumerate(self.models):
+            shift = np.einsum('nij,nj->ni', model.slopes,
+                              place @ self.job.factors[k].T)
+            step = _step(np.where(restless[k], light[k], 0), shift)
+            model.take_in_place(step, levels[k], np.flatnonzero(restless[k]))
+        self._form_equations()
+
+    # What a search leaves behind.
+
+    def reject(self, places):
+        """Remember places (n, 2) where no star is to be added again."""
+        self.rejected = np.concatenate([self.rejected, places])
+
+    def note_repeats(self, entries, host):
+        """Remember which numbers' stars the entries of a list mean."""
+        self.repeats += zip(entries.number, host, entries.x_init,
+                            entries.y_init, strict=True)
+
+    def note_widths(self, measure):
+        """Remember by how much each image's PSF is too narrow."""
+        self.widths = [measure(model) for model in self.models]
+
+
+def _step(flux, shift):
+    return np.column_stack([flux, shift])
+
+
+def phases(psf, shape):
+    """Draw a star for each cell and each part of a pixel."""
+    y, x = (np.arange(0, n, CELL) for n in shape)
+    y, x = ((low + np.minimum(low + CELL, n)) // 2
+            for low, n in zip((y, x), shape, strict=True))
+    parts = (np.arange(_PHASES) + 0.5) / _PHASES - 0.5
+    at = np.meshgrid(x, y)
+    stamps = psf.stamps(*(one.ravel().astype(float) for one in at),
+                        _TEMPLATE_HALF, [(dx, dy) for dy in parts
+                                         for dx in parts])
+    return kernels.Phases(stamps.reshape(
+        y.size, x.size, _PHASES, _PHASES, *stamps.shape[2:]), CELL)

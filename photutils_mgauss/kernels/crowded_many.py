@@ -1,0 +1,435 @@
+"""The evidence for stars in many images, and what their fit leaves open."""
+from math import floor, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from photutils_mgauss.kernels.crowded_fit import (
+    apply_joint,
+    joint_matrix,
+    members_of,
+    scale_matrix,
+)
+from photutils_mgauss.kernels.crowded_search import (
+    MOST_BESIDE,
+    Scratch,
+    score_pixel,
+    stars_around,
+    template_products,
+)
+from photutils_mgauss.kernels.jit import inner, kernel
+from photutils_mgauss.kernels.linear import cholesky
+
+# The covariance of a star is that with so many stars free, itself included.
+MOST_TOGETHER = 9
+
+
+class Phases(NamedTuple):
+    """
+    Stamps (cells along y, along x, phases of y, of x, 2h + 1, 2h + 1).
+
+    A star stands in the middle of its part of the central pixel. Each serves
+    for cell x cell pixels.
+    """
+
+    stamps: np.ndarray
+    cell: int
+
+
+class Points(NamedTuple):
+    """Where in an image the points of a grid are, x and y (ny, nx)."""
+
+    x: np.ndarray
+    y: np.ndarray
+
+
+class Evidence(NamedTuple):
+    """
+    What an image says of a star at each point of a grid (ny, nx).
+
+    The gradient of half of -chi2 by its flux, the information on it, and both
+    of a star beside which nothing is free.
+    """
+
+    gradient: np.ndarray
+    information: np.ndarray
+    bare_gradient: np.ndarray
+    bare: np.ndarray
+
+
+@inner
+def _phase(value, n):
+    """Return the pixel a position is in, and in which of its n parts."""
+    pixel = int(np.rint(value))
+    return pixel, min(max(int(floor((value - pixel + 0.5) * n)), 0), n - 1)
+
+
+@inner
+def _isolated(x, y, template, weight, residual):
+    """Return gradient and information of a star on a constant at a pixel."""
+    ny, nx = residual.shape
+    h = template.shape[0] // 2
+    pr = pp = ps = rs = ws = seen = power = 0.0
+    for j in range(-h, h + 1):
+        for i in range(-h, h + 1):
+            t = template[h + j, h + i]
+            power += t * t
+            if not (0 <= y + j < ny and 0 <= x + i < nx):
+                continue
+            w = weight[y + j, x + i]
+            r = residual[y + j, x + i]
+            wt = w * t
+            pr += wt * r
+            pp += wt * t
+            ps += wt
+            rs += w * r
+            ws += w
+            if w > 0:
+                seen += t * t
+    if not 3 * seen > power:
+        return 0.0, 0.0, 0.0, 0.0
+    info = pp - ps * ps / ws
+    if not info > 0:
+        return 0.0, 0.0, pr, pp
+    return pr - ps * rs / ws, info, pr, pp
+
+
+@kernel
+def evidence(points, phases, weight, residual, out):
+    """Ask at each point of a grid what an image says of a star there."""
+    stamps, cell = phases
+    n = stamps.shape[2]
+    ny, nx = residual.shape
+    for row in range(out.gradient.shape[0]):
+        for column in range(out.gradient.shape[1]):
+            x, part_x = _phase(points.x[row, column], n)
+            y, part_y = _phase(points.y[row, column], n)
+            g = info = bare_g = bare = 0.0
+            if 0 <= x < nx and 0 <= y < ny:
+                g, info, bare_g, bare = _isolated(
+                    x, y, stamps[y // cell, x // cell, part_y, part_x],
+                    weight, residual)
+            out.gradient[row, column] = g
+            out.information[row, column] = info
+            out.bare_gradient[row, column] = bare_g
+            out.bare[row, column] = bare
+
+
+@kernel(allocates=True)
+def evidence_beside(column, row, fit, points, phases, planes, limits, side,
+                    wanted, out):
+    r"""
+    Ask again at points close to stars, with these free to readjust.
+
+    Stars are near column and row (n,) of the grid. Points that are not wanted
+    (ny, nx) get nothing. With what `score_beside` calls g, h, a, N, n and v,
+
+    .. math::
+
+        i = h - a^T N^{-1} a, \quad (g - a^T N^{-1} n) \frac{i}{i + v}, \quad
+        \frac{i^2}{i + v}
+
+    are gradient and information; 0 where less than the fraction least of h is
+    left. No point within limits.reach of a star is more than side points of
+    the grid off.
+    """
+    stamps, cell = phases
+    px, py, _ = fit.sources
+    weight, residual, light = planes
+    ny, nx = residual.shape
+    n_rows, n_columns = wanted.shape
+    n = stamps.shape[2]
+    size = 3 * MOST_BESIDE
+    members, sums = np.empty(MOST_BESIDE, np.int64), np.empty(3)
+    scratch = Scratch(members, np.empty((size, size)), np.empty((size, 2)),
+                      sums)
+    reach = limits.reach
+    for i in range(px.size):
+        middle, centre = int(np.rint(row[i])), int(np.rint(column[i]))
+        for v in range(max(0, middle - side), min(n_rows, middle + side + 1)):
+            for u in range(max(0, centre - side),
+                           min(n_columns, centre + side + 1)):
+                at_x, at_y = points.x[v, u], points.y[v, u]
+                if (px[i] - at_x)**2 + (py[i] - at_y)**2 > reach * reach:
+                    continue
+                count = stars_around(at_x, at_y, i, px, py, fit.pairs.indptr,
+                                     fit.pairs.neighbour, members)
+                if count == 0:
+                    continue
+                out.gradient[v, u] = out.information[v, u] = 0.0
+                x, part_x = _phase(at_x, n)
+                y, part_y = _phase(at_y, n)
+                if not (wanted[v, u] and 0 <= x < nx and 0 <= y < ny):
+                    continue
+                template = stamps[y // cell, x // cell, part_y, part_x]
+                if not template_products(x, y, template, weight, residual,
+                                         light, sums):
+                    continue
+                strength, flux = score_pixel(x, y, count, fit, template,
+                                             weight, limits.least, scratch)
+                if flux != 0:
+                    known = (strength / flux)**2
+                    out.gradient[v, u] = flux * known
+                    out.information[v, u] = known
+
+
+# Image k shows a star at the place F_k q: q are the p numbers that all images
+# have in common, its column and row and what else moves it, and F_k (2, p),
+# the same for all stars, are the factors of the image.
+
+class Together(NamedTuple):
+    """
+    Stars fitted with up to `MOST_TOGETHER` - 1 of their neighbours.
+
+    Star i is the first of the first count[i] of members (n, m); free (n, p m,
+    p m) is the information on what places are made of, and in the end its
+    inverse.
+    """
+
+    members: np.ndarray
+    count: np.ndarray
+    free: np.ndarray
+
+
+class Work(NamedTuple):
+    """Scratch: the matrix of some stars, the fluxes' own, and their share."""
+
+    whole: np.ndarray
+    light: np.ndarray
+    share: np.ndarray
+    scale: np.ndarray
+
+
+@inner
+def _divide(i, together, stars, pairs, factors, where, work):
+    """
+    Put the matrix of a star and its neighbours into work, fluxes apart.
+
+    light becomes the factor of the fluxes' own matrix, with a diagonal of 1
+    before, and share (m, p m) that times what couples fluxes to places.
+    """
+    members, count = together.members[i], together.count[i]
+    whole, light, share, scale = work
+    p = factors.shape[1]
+    joint_matrix(members, count, stars.matrix, stars.blocks, pairs.indptr,
+                 pairs.neighbour, where, whole)
+    for a in range(count):
+        for b in range(count):
+            light[a, b] = whole[3 * a, 3 * b]
+            for q in range(p):
+                share[a, p * b + q] = (
+                    whole[3 * a, 3 * b + 1] * factors[0, q]
+                    + whole[3 * a, 3 * b + 2] * factors[1, q])
+    scale_matrix(light, count, scale)
+    cholesky(light, count, 1e-12)
+    for a in range(count):
+        for b in range(p * count):
+            value = scale[a] * share[a, b]
+            for c in range(a):
+                value -= light[a, c] * share[c, b]
+            share[a, b] = value / light[a, a]
+
+
+@kernel(allocates=True)
+def add_places(first, stars, pairs, factors, together):
+    """
+    Add what an image says of places, its fluxes free, to together.free.
+
+    Of stars from the first on; members are made here and stay.
+    """
+    m, p = together.members.shape[1], factors.shape[1]
+    work = Work(np.empty((3 * m, 3 * m)), np.empty((m, m)),
+                np.empty((m, p * m)), np.empty(m))
+    where = np.full(stars.matrix.shape[0], -1)
+    for i in range(together.count.size):
+        together.count[i] = members_of(
+            first + i, pairs.indptr, pairs.neighbour, together.members[i])
+        _divide(i, together, stars, pairs, factors, where, work)
+        count = together.count[i]
+        for a in range(p * count):
+            at, q = 3 * (a // p), a % p
+            for b in range(p * count):
+                to, r = 3 * (b // p), b % p
+                value = 0.0
+                for c in range(2):
+                    for d in range(2):
+                        value += (factors[c, q] * factors[d, r]
+                                  * work.whole[at + 1 + c, to + 1 + d])
+                for c in range(count):
+                    value -= work.share[c, a] * work.share[c, b]
+                together.free[i, a, b] += value
+
+
+@kernel(allocates=True)
+def invert_places(together):
+    """Overwrite together.free by its inverse, NaN where it has none."""
+    largest, m = together.free.shape[1], together.members.shape[1]
+    scale, column = np.empty(largest), np.empty(largest)
+    factor = np.empty((largest, largest))
+    for i in range(together.count.size):
+        size = largest // m * together.count[i]
+        for a in range(size):
+            for b in range(size):
+                factor[a, b] = together.free[i, a, b]
+        scale_matrix(factor, size, scale)
+        solved = cholesky(factor, size, 1e-12)
+        for a in range(largest // m):
+            solved = solved and scale[a] > 0
+        for a in range(size):
+            for b in range(size):
+                column[b] = 1.0 if a == b else 0.0
+            for b in range(size):
+                for c in range(b):
+                    column[b] -= factor[b, c] * column[c]
+                column[b] /= factor[b, b]
+            for b in range(size - 1, -1, -1):
+                for c in range(b + 1, size):
+                    column[b] -= factor[c, b] * column[c]
+                column[b] /= factor[b, b]
+            for b in range(size):
+                together.free[i, a, b] = (column[b] * scale[a] * scale[b]
+                                          if solved else np.nan)
+
+
+@kernel(allocates=True)
+def flux_variances(stars, pairs, factors, together, variance, correlation):
+    """
+    Put the variances of fluxes in an image into variance (n,).
+
+    together.free is the covariance of places in all images. correlation (n,)
+    takes that with the flux of the first neighbour, 0 if there is none.
+    """
+    m, p = together.members.shape[1], factors.shape[1]
+    work = Work(np.empty((3 * m, 3 * m)), np.empty((m, m)),
+                np.empty((m, p * m)), np.empty(m))
+    where = np.full(stars.matrix.shape[0], -1)
+    columns, gains = np.empty((2, m)), np.empty((2, p * m))
+    for i in range(together.count.size):
+        _divide(i, together, stars, pairs, factors, where, work)
+        count = together.count[i]
+        products = np.zeros((2, 2))
+        for s in range(min(count, 2)):
+            _light_column(s, count, work, columns[s])
+            for b in range(p * count):
+                gains[s, b] = 0.0
+                for a in range(count):
+                    gains[s, b] += columns[s, a] * work.share[a, b]
+        for s in range(min(count, 2)):
+            for t in range(s + 1):
+                value = 0.0
+                for a in range(count):
+                    value += columns[s, a] * columns[t, a]
+                for a in range(p * count):
+                    for b in range(p * count):
+                        value += (gains[s, a] * together.free[i, a, b]
+                                  * gains[t, b])
+                products[s, t] = value * work.scale[s] * work.scale[t]
+        known = work.scale[0] > 0
+        variance[i] = products[0, 0] if known else np.nan
+        correlation[i] = 0.0
+        if known and count > 1 and work.scale[1] > 0:
+            correlation[i] = products[1, 0] / sqrt(products[0, 0]
+                                                   * products[1, 1])
+
+
+@inner
+def _light_column(s, count, work, out):
+    """Put column s of the inverse of the factor of fluxes into out."""
+    for a in range(count):
+        value = 1.0 if a == s else 0.0
+        for c in range(s, a):
+            value -= work.light[a, c] * out[c]
+        out[a] = value / work.light[a, a] if a >= s else 0.0
+
+
+# The unknowns of the equations of E images with n stars are one flat vector:
+# n fluxes of each image, p numbers for the places of each star, then the
+# levels of the nodes of each image's background.
+
+@kernel
+def apply_shared(k, factors, first, v, stars, pairs, mesh, scratch, out):
+    """
+    Add the product of the equations of image k with v to out.
+
+    factors (E, 2, p) are those of all images. Its levels begin at first;
+    scratch is (2, 3 n + m).
+    """
+    n, (n_images, _, p) = stars.matrix.shape[0], factors.shape
+    own, product = scratch[0], scratch[1]
+    light, place = k * n, n_images * n
+    for i in range(n):
+        own[3 * i] = v[light + i]
+        x = y = 0.0
+        for q in range(p):
+            x += factors[k, 0, q] * v[place + p * i + q]
+            y += factors[k, 1, q] * v[place + p * i + q]
+        own[3 * i + 1], own[3 * i + 2] = x, y
+    m = mesh.diagonal.size
+    for i in range(m):
+        own[3 * n + i] = v[first + i]
+    apply_joint(own, stars, pairs, mesh, product)
+    for i in range(n):
+        out[light + i] += product[3 * i]
+        for q in range(p):
+            out[place + p * i + q] += (
+                factors[k, 0, q] * product[3 * i + 1]
+                + factors[k, 1, q] * product[3 * i + 2])
+    for i in range(m):
+        out[first + i] += product[3 * n + i]
+
+
+class Blocks(NamedTuple):
+    """
+    What the inverses of stars' own blocks, and of nodes, are made of.
+
+    The inverse of each flux's diagonal, own (E, n), what couples fluxes to
+    places, share (E, n, p), the inverse of what is left of the places' blocks,
+    free (n, p, p), and that of the nodes' diagonals, level (m,).
+    """
+
+    own: np.ndarray
+    share: np.ndarray
+    free: np.ndarray
+    level: np.ndarray
+
+
+@kernel(allocates=True)
+def precondition_shared(blocks, r, z):
+    """Put the inverse blocks times r into z; return the product of both."""
+    own, share, free, level = blocks
+    (n_images, n), p = own.shape, free.shape[1]
+    place, left = n_images * n, np.empty(p)
+    product = 0.0
+    for i in range(n):
+        at = place + p * i
+        for q in range(p):
+            left[q] = r[at + q]
+            for k in range(n_images):
+                left[q] -= share[k, i, q] * r[k * n + i] * own[k, i]
+        for q in range(p):
+            z[at + q] = 0.0
+            for s in range(p):
+                z[at + q] += free[i, q, s] * left[s]
+            product += r[at + q] * z[at + q]
+        for k in range(n_images):
+            light = r[k * n + i]
+            for q in range(p):
+                light -= share[k, i, q] * z[at + q]
+            z[k * n + i] = own[k, i] * light
+            product += r[k * n + i] * z[k * n + i]
+    first = place + p * n
+    for m in range(level.size):
+        z[first + m] = r[first + m] * level[m]
+        product += r[first + m] * z[first + m]
+    return product
+
+
+@kernel
+def advance(length, v, a, step, r):
+    """Take a step of conjugate gradients; a is the matrix times v."""
+    product = 0.0
+    for i in range(v.size):
+        product += v[i] * a[i]
+    for i in range(v.size):
+        step[i] += length / product * v[i]
+        r[i] -= length / product * a[i]
