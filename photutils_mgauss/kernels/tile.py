@@ -11,7 +11,6 @@ from photutils_mgauss.kernels.gaussian import (
 from photutils_mgauss.kernels.grid import blend_weights
 from photutils_mgauss.kernels.jit import inner, loop
 from photutils_mgauss.kernels.linear import clear
-from photutils_mgauss.kernels.pixels import N_NODES, add_integrals
 from photutils_mgauss.kernels.series import (
     LANES,
     LEFT_OUT,
@@ -99,37 +98,18 @@ def _add_walk(p, s, fall, width, walk, tile):
 
 
 @inner
-def _add_points(a, dx, dy, p, s, q, by_x, by_y, height, width, tile):
+def _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height, width,
+                tile):
     """Add a Gaussian to a tile, each pixel for itself."""
     for i in range(width):
         for j in range(height):
             u, v = dx + i, dy + j
-            g = a * point_value(u, v, p, s, q, False)
-            gx, gy = point_gradient(u, v, p, s, q, False)
+            g = a * point_value(u, v, p, s, q, integrated)
+            gx, gy = point_gradient(u, v, p, s, q, integrated)
             k = 3 * LANES * i + j
             tile[k] += g
             tile[k + LANES] += by_x * g - a * gx
             tile[k + 2 * LANES] += by_y * g - a * gy
-
-
-@inner
-def _add_pixels(a, dx, dy, p, s, q, by_x, by_y, faint, height, width, work,
-                tile):
-    """Add a Gaussian that is integrated over pixels to a tile."""
-    # Next to a node the share of another is nothing, but its slope is not.
-    most = pixel_peak(a, p, q) * max(1.0, abs(by_x), abs(by_y))
-    left_out = log(faint / most)
-    if not left_out < 0:
-        return
-    ratio, terms = series_length(p, s, q, left_out)
-    if terms:
-        add_series(a, dx, dy, p, s, q, ratio, terms, sqrt(-2 * left_out),
-                   by_x, by_y, height, width, work[_WALK:], tile)
-        return
-    nodes = work[:2 * N_NODES].reshape((2, N_NODES))
-    for j in range(height):
-        add_integrals(a, dx, dy + j, p, s, q, by_x, by_y, nodes, width,
-                      3 * LANES, tile[j:])
 
 
 @inner
@@ -154,15 +134,23 @@ def add_gaussian(a, dx, dy, p, s, q, stride, by_x, by_y, integrated, faint,
     walk (SCRATCH,) begins with zeros.
     """
     if integrated:
-        _add_pixels(a, dx, dy, p, s, q, by_x, by_y, faint, height, width,
-                    walk, tile)
-        return
+        # Next to a node the share of another is nothing, its slope is not.
+        most = pixel_peak(a, p, q) * max(1.0, abs(by_x), abs(by_y))
+        left_out = log(faint / most)
+        if not left_out < 0:
+            return
+        ratio, terms = series_length(p, s, q, left_out)
+        if terms:
+            add_series(a, dx, dy, p, s, q, ratio, terms, sqrt(-2 * left_out),
+                       by_x, by_y, height, width, walk[_WALK:], tile)
+            return
     left = min(dx - s * dy, dx - s * (dy + height - 1))
     # A walk that begins too far out begins at zero.
-    steep = (p > 50 or q > 50 or p * abs(s) * height > 200
+    steep = (integrated or p > 50 or q > 50 or p * abs(s) * height > 200
              or (left < 0 and p * left * left > 600))
     if steep:
-        _add_points(a, dx, dy, p, s, q, by_x, by_y, height, width, tile)
+        _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height, width,
+                    tile)
     elif _walk_starts(a, dx - s * dy, dy, p, s, q, stride, by_x, by_y, height,
                       walk):
         _add_walk(p, s, stride[3], width, walk, tile)
