@@ -32,13 +32,17 @@ def add_options(parser):
     group.add_argument('--forced', action='store_true',
                        help='with --targets: fit fluxes only, at the places '
                             'and motions of the table')
+    group.add_argument('--refine-frames', action='store_true',
+                       help='with --pixels: find the frames of the images '
+                            'from the pixels of bright stars, too')
 
 
 def check_alone(options):
     """Raise for options that need --pixels, which is not given."""
-    for name in ('psf', 'frames', 'targets', 'forced'):
+    for name in ('psf', 'frames', 'targets', 'forced', 'refine_frames'):
         if getattr(options, name):
-            msg = f'--{name} must be given with --pixels only'
+            msg = (f'--{name.replace("_", "-")} must be given with --pixels '
+                   'only')
             raise ValueError(msg)
 
 
@@ -82,6 +86,9 @@ def _check(options):
         raise ValueError(msg)
     if options.forced and not options.targets:
         msg = '--forced must have --targets, a table of places'
+        raise ValueError(msg)
+    if options.forced and options.refine_frames:
+        msg = '--refine-frames must be given without --forced'
         raise ValueError(msg)
     if options.plane or options.parallax_of or options.references:
         msg = ('--pixels must be given without --plane, --parallax-of and '
@@ -145,6 +152,7 @@ def _solve(options, epochs):
         stars, _ = read_table(options.targets)
     fitter = PixelMotionFitter(parallax=options.parallax,
                                forced=options.forced,
+                               refine_frames=options.refine_frames,
                                fit_shape=options.fit_shape)
     return fitter.fit(epochs, stars)
 

@@ -97,7 +97,7 @@ class Sample:
             self.stamps, np.zeros(self.stamps.data.shape), basis, self.sources,
             self.sources.copy(), hold, self.count, np.zeros(n),
             bool(local_bkg), np.ones(n, bool), self.exposure, FreeShapes(),
-            np.zeros((n, 3)), extra)
+            np.zeros((n, 3)), extra=extra)
 
     def without_deviant(self, used):
         """Return the sample in which the stars not used (n,) are deviant."""

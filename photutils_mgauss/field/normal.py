@@ -71,10 +71,10 @@ class FieldProblem:
         What the polynomials mean.
     local : (n, ...) `~numpy.ndarray`
         What the form needs to know of each star.
-    extra : (n, X) `~numpy.ndarray`
-        Terms that do not depend on the degree, as those of colours.
     pixel_integrated : bool
         Whether the shapes are integrated over pixels, not sampled.
+    extra : (n, X) `~numpy.ndarray`, optional
+        Terms that do not depend on the degree, as those of colours.
     """
 
     stamps: object
@@ -90,8 +90,12 @@ class FieldProblem:
     exposure: np.ndarray
     form: object
     local: np.ndarray
-    extra: np.ndarray
     pixel_integrated: bool = False
+    extra: np.ndarray = None
+
+    def __post_init__(self):
+        if self.extra is None:
+            self.extra = np.zeros((len(self.basis), 0))
 
     @property
     def n_extra(self):

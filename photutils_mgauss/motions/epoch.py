@@ -77,7 +77,7 @@ class Epoch:
           east. Each is one measurement.
 
         Optional columns: ``id`` (any type, unique), ``flux_fit``,
-        ``radial_velocity`` [km/s], and ``time``, the time of each row.
+        ``radial_velocity`` [km/s], its ``_error``, and ``time`` of each row.
         Columns may have other units. Masked and non-finite positions are
         left out and flagged; errors that are not positive get no weight
         and a flag.

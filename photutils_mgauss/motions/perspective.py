@@ -18,12 +18,14 @@ class Nearing:
     The k stars whose approach or recession is known.
 
     ``stars`` (k,) are their sorted numbers, ``velocity`` (k,) their radial
-    velocities [km/s], ``parallax`` (k,) what is known of their parallaxes
-    beforehand [mas], 0 where that is nothing.
+    velocities [km/s], ``error`` (k,) those of these, 0 where they are not
+    given, ``parallax`` (k,) what is known of their parallaxes beforehand
+    [mas], 0 where that is nothing.
     """
 
     stars: np.ndarray
     velocity: np.ndarray
+    error: np.ndarray
     parallax: np.ndarray
 
     def values(self, which, found, origin):

@@ -7,7 +7,7 @@ import numpy as np
 
 from photutils_mgauss.motions.assemble import Sightings
 from photutils_mgauss.motions.chips import Distortion, distortion_of
-from photutils_mgauss.motions.epoch import magnitudes, pixels
+from photutils_mgauss.motions.epoch import magnitudes, numbers, pixels
 from photutils_mgauss.motions.error_scale import ErrorScales
 from photutils_mgauss.motions.perspective import Nearing
 from photutils_mgauss.motions.priors import (
@@ -372,6 +372,7 @@ def _nearing(sightings, options):
     use = known & (np.isfinite(parallax) | bool(options.parallax))
     stars, left = np.flatnonzero(use), np.sum(known & ~use)
     nearing = Nearing(stars, sightings.radial_velocity[stars],
+                      np.nan_to_num(_velocity_errors(sightings)[stars]),
                       np.nan_to_num(parallax[stars]))
     if not left:
         return nearing, ()
@@ -379,6 +380,18 @@ def _nearing(sightings, options):
     note = (f'The radial velocity of {of} is not used, because the parallax '
             'is not known: give references with parallaxes, or fit them.')
     return nearing, (note,)
+
+
+def _velocity_errors(sightings):
+    """Return the errors (n,) of radial velocities [km/s], NaN if unknown."""
+    each = sightings.matches.take([
+        numbers(epoch.table, 'radial_velocity_error', u.km / u.s)
+        for epoch in sightings.epochs])
+    out = np.fmax.reduce(each, axis=0)
+    stars, catalogue = sightings.references, sightings.catalogue
+    out[stars] = np.where(np.isfinite(catalogue.radial_velocity),
+                          catalogue.velocity_error, out[stars])
+    return out
 
 
 def _drift(sightings, origin, options):

@@ -98,42 +98,48 @@ def build_priors(catalogue, stars, origin, year, unit, n_parameters):
     precision = np.zeros((n_parameters, n_parameters, k))
     moment = np.zeros((n_parameters, k))
     constant = np.zeros(k)
-    zero = ZERO[unit]
-    for i in range(k):
-        matrix, covariance, value = _known(catalogue, i, origin[:, i], year,
-                                           zero, size)
-        weighted = np.linalg.solve(covariance, matrix)
-        precision[:size, :size, i] = matrix.T @ weighted
-        moment[:size, i] = value @ weighted
-        constant[i] = value @ np.linalg.solve(covariance, value)
+    values, covariance, matrix = _equations(catalogue, origin, year,
+                                            ZERO[unit])
+    known = np.isfinite(values) & (
+        np.einsum('iik->ik', covariance) < 1e-3 * UNKNOWN)
+    known = known[:size]
+    # References of which the same is known, all at once.
+    for pattern in np.unique(known, axis=1).T:
+        rows = np.flatnonzero(pattern)
+        some = np.flatnonzero((known == pattern[:, None]).all(axis=0))
+        own = matrix[np.ix_(some, rows, np.arange(size))]
+        inner = np.moveaxis(covariance[np.ix_(rows, rows, some)], 2, 0)
+        value = values[np.ix_(rows, some)].T
+        weighted = np.linalg.solve(inner, own)
+        precision[:size, :size, some] = np.moveaxis(
+            np.swapaxes(own, 1, 2) @ weighted, 0, 2)
+        moment[:size, some] = np.einsum('kr,krp->pk', value, weighted)
+        constant[some] = np.einsum('kr,kr->k', value, np.linalg.solve(
+            inner, value[..., None])[..., 0])
     order = np.argsort(stars)
     return Priors(np.asarray(stars), precision, moment,
                   constant).pick(order)
 
 
-def _known(catalogue, i, origin, year, zero, size):
+def _equations(catalogue, origin, year, zero):
     """
-    Return what is known of reference i: matrix M, covariance and values.
+    Return values (5, k), their covariances and matrices M (k, 5, 5).
 
     The catalogue's values are M v for the parameters v at the working
-    epoch; rows without an error are left out.
+    epoch; what is not known is NaN or without an error.
     """
-    value = catalogue.values[:, i].copy()
-    covariance = catalogue.covariance[..., i].copy()
-    matrix = np.eye(5)
-    if np.isfinite(catalogue.year[i]):
-        matrix[0, 2] = matrix[1, 3] = catalogue.year[i] - year
-    value[:2] -= origin
-    if catalogue.kinds[i] in FIXED:
-        value[2:] = 0
-        covariance[2:] = covariance[:, 2:] = 0
-        covariance[[2, 3, 4], [2, 3, 4]] = zero**2
-    if catalogue.kinds[i] == 'position':
-        value[2:] = np.nan
-    known = np.isfinite(value) & (np.diag(covariance) < 1e-3 * UNKNOWN)
-    known = np.flatnonzero(known[:size])
-    return (matrix[known, :size], covariance[np.ix_(known, known)],
-            value[known])
+    values, covariance = catalogue.values.copy(), catalogue.covariance.copy()
+    matrix = np.repeat(np.eye(5)[None], values.shape[1], axis=0)
+    matrix[:, 0, 2] = matrix[:, 1, 3] = np.where(
+        np.isfinite(catalogue.year), catalogue.year - year, 0.0)
+    values[:2] -= origin
+    fixed = np.isin(catalogue.kinds, FIXED)
+    values[2:, fixed] = 0
+    covariance[2:, :, fixed] = covariance[:, 2:, fixed] = 0
+    for k in (2, 3, 4):
+        covariance[k, k, fixed] = zero**2
+    values[2:, catalogue.kinds == 'position'] = np.nan
+    return values, covariance, matrix
 
 
 def weak_priors(n_stars, n_parameters, sigma):

@@ -51,6 +51,9 @@ def at_epoch(fit, year, stars):
         moved[:len(swerve), near] += swerve
         half = np.einsum('ijn,jkn->ikn', change, covariance[..., near])
         spread[..., near] = np.einsum('ijn,kjn->ikn', half, change)
+        by_error = _by_velocity_error(fit, year, numbers[near])
+        n = len(by_error)
+        spread[:n, :n, near] += by_error[:, None] * by_error
     moved[:2] += fit.setup.origin[:, stars]
     return moved, spread
 
@@ -84,6 +87,20 @@ def _in_space(fit, year, stars):
     return beyond_straight(values, velocity, dt)[:size], change
 
 
+def _by_velocity_error(fit, year, stars):
+    """Return what one error of the radial velocity changes, (size, k)."""
+    nearing, dt = fit.setup.nearing, year - fit.setup.working_year
+    size = 5 if fit.setup.options.parallax else 4
+    which = np.searchsorted(nearing.stars, stars)
+    values = nearing.values(which, fit.estimates.values[:size, stars],
+                            fit.setup.origin[:, stars])
+    velocity, error = nearing.velocity[which], nearing.error[which]
+    step = np.maximum(error, 1e-3)
+    more, less = (beyond_straight(values, velocity + sign * step, dt)[:size]
+                  for sign in (1, -1))
+    return (more - less) / 2 * (error / step)
+
+
 def star_covariance(fit, stars, ref_year):
     """Return covariances (k, p, k, p) in Gaia's order, at an epoch."""
     problem = fit.problem.select(stars)
@@ -94,11 +111,18 @@ def star_covariance(fit, stars, ref_year):
     if near.size:
         change[near] = _in_space(fit, ref_year, stars[near])[1].transpose(
             2, 0, 1)
+    own = np.zeros((len(stars), size, size))
+    if near.size:
+        by_error = _by_velocity_error(fit, ref_year, stars[near]).T
+        n = by_error.shape[1]
+        own[near, :n, :n] = by_error[:, :, None] * by_error[:, None]
     plane = fit.setup.sightings.plane
     if plane is not None:
         places = at_epoch(fit, ref_year, stars)[0][:2]
-        change = turns(plane, places, size).transpose(2, 0, 1) @ change
+        turn = turns(plane, places, size).transpose(2, 0, 1)
+        change, own = turn @ change, turn @ own @ np.swapaxes(turn, 1, 2)
     covariance = np.einsum('kij,kjlm,lnm->kiln', change, covariance, change)
+    covariance[np.arange(len(stars)), :, np.arange(len(stars))] += own
     order = [k for k in FROM_OURS if k < size] if (
         fit.setup.options.parallax) else [0, 1, 2, 3]
     return covariance[:, order][:, :, :, order]

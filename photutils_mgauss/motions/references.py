@@ -34,6 +34,7 @@ class Catalogue:
 
     ``values`` (5, k) and ``covariance`` (5, 5, k) are position, motion and
     parallax on the plane [unit, unit/yr], at Julian years ``year`` (k,).
+    ``velocity_error`` (k,) is that of the ``radial_velocity`` [km/s].
     ``rows`` (k,) are those of the user's table, -1 without one, and
     ``source_ids`` (k,) what it calls the objects, if it does.
     """
@@ -44,6 +45,7 @@ class Catalogue:
     covariance: np.ndarray
     year: np.ndarray
     radial_velocity: np.ndarray
+    velocity_error: np.ndarray
     rows: np.ndarray
     source_ids: np.ndarray | None
 
@@ -81,6 +83,7 @@ class Catalogue:
             values=self.values[:, which],
             covariance=self.covariance[..., which], year=self.year[which],
             radial_velocity=self.radial_velocity[which],
+            velocity_error=self.velocity_error[which],
             rows=self.rows[which],
             source_ids=(None if self.source_ids is None
                         else self.source_ids[which]))
@@ -91,7 +94,7 @@ def quasars(n):
     nothing = np.full(n, np.nan)
     return Catalogue(None, np.full(n, 'qso'), np.full((5, n), np.nan),
                      np.repeat(UNKNOWN * np.eye(5)[..., None], n, axis=2),
-                     nothing, nothing, np.full(n, -1), None)
+                     nothing, nothing, nothing, np.full(n, -1), None)
 
 
 def read_catalogue(table, plane, unit):
@@ -122,6 +125,7 @@ def read_catalogue(table, plane, unit):
     names = (np.asarray(table['source_id'])
              if 'source_id' in table.colnames else None)
     return Catalogue(ids, kinds, values, covariance, years, velocity,
+                     numbers(table, 'radial_velocity_error', u.km / u.s),
                      np.arange(n), names)
 
 

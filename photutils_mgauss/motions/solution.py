@@ -96,8 +96,11 @@ class MotionSolution:
         [mas], ``pmra`` (with the cosine of the declination in it) and
         ``pmdec`` [mas / yr], an ``_error`` for each, the ten ``_corr``,
         ``ref_epoch`` (Julian year, TDB), ``n_obs``, ``n_good_obs``,
-        ``visibility_periods_used``, ``chi2``, ``dof``, ``uwe``, ``flags``
-        (see `decode_motion_flags`).
+        ``visibility_periods_used``, ``chi2``, ``dof``, ``uwe``, ``ruwe``
+        (over what is usual at the star's flux), ``flags`` (see
+        `decode_motion_flags`); with accelerations ``accra``, ``accdec``,
+        their errors, and ``acc_significance``, the length of that vector in
+        its errors.
     epochs : list of `Epoch`
         The epochs given, with corrected WCS.
     alignment : `~astropy.table.QTable`

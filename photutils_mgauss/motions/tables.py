@@ -2,6 +2,7 @@
 import astropy.units as u
 import numpy as np
 from astropy.table import MaskedColumn, QTable
+from scipy.special import chdtri
 
 from photutils_mgauss.motions.baseline import period
 from photutils_mgauss.motions.joint import solve_all
@@ -46,11 +47,14 @@ UCDS = {
     'ref_epoch': 'meta.ref;time.epoch', 'n_obs': 'meta.number;obs',
     'n_good_obs': 'meta.number;obs', 'chi2': 'stat.fit.chi2',
     'dof': 'stat.fit.dof', 'uwe': 'stat.fit.goodness',
+    'ruwe': 'stat.fit.goodness',
     'flux': 'phot.flux', 'flags': 'meta.code.qual',
     'radial_velocity': 'spect.dopplerVeloc', 'source_id': 'meta.id',
     'visibility_periods_used': 'meta.number;obs'}
 GAIA = ('ra', 'dec', 'parallax', 'pmra', 'pmdec')
 STRONG = 0.3
+EACH = 50  # stars of like flux that tell what is usual
+MOST_GROUPS = 100
 
 
 def visibility_periods(sightings, used):
@@ -189,6 +193,9 @@ def add_parameters(table, values, covariance, unit, *, on_sky, parallax,
         if extra is not None:
             table[name] = extra[0][k] * unit / u.yr**2
             table[f'{name}_error'] = extra[1][k] * unit / u.yr**2
+    if extra is not None:
+        # As of the length of a vector; its square is a chi-square of two.
+        table['acc_significance'] = extra[2]
 
 
 def _gaia_order(values, covariance, has_parallax, acceleration):
@@ -196,8 +203,11 @@ def _gaia_order(values, covariance, has_parallax, acceleration):
     n = values.shape[1]
     extra = None
     if acceleration:
-        extra = values[-2:], np.sqrt(np.stack([covariance[-2, -2],
-                                               covariance[-1, -1]]))
+        last = covariance[-2, -2], covariance[-2, -1], covariance[-1, -1]
+        a, b, c = invert_2x2(*last)
+        x, y = values[-2:]
+        extra = (values[-2:], np.sqrt(np.stack(last[::2])),
+                 np.sqrt(a * x * x + 2 * b * x * y + c * y * y))
     size = 5 if has_parallax else 4
     nothing = np.full(n, np.nan)
     full = [values[k] if k < size else nothing for k in FROM_OURS]
@@ -243,6 +253,32 @@ def _add_quality(table, fit, solved):
     table['dof'] = np.where(tested, dof, np.nan)
     with np.errstate(invalid='ignore', divide='ignore'):
         table['uwe'] = np.sqrt(table['chi2'] / table['dof'])
+    table['ruwe'] = _renormalised(table['chi2'], table['dof'],
+                                  sightings.flux)
+
+
+def _renormalised(chi2, dof, flux):
+    """
+    Return ``uwe`` over what is usual at the star's magnitude.
+
+    Usual is the median of chi-squares over their expected medians, of stars
+    next in flux, which binaries and blends do not move; NaN without fluxes
+    or with too few stars.
+    """
+    known = np.flatnonzero((dof > 0) & (flux > 0) & np.isfinite(chi2))
+    out = np.full(len(chi2), np.nan)
+    n_groups = min(len(known) // EACH, MOST_GROUPS)
+    if not n_groups:
+        return out
+    ratio = np.asarray(chi2)[known] / chdtri(np.asarray(dof)[known], 0.5)
+    size = np.log(flux[known])
+    groups = np.array_split(np.argsort(size), n_groups)
+    at = [np.median(size[some]) for some in groups]
+    usual = np.interp(size, at,
+                      [np.median(ratio[some]) for some in groups])
+    out[known] = np.sqrt(np.asarray(chi2)[known] / np.asarray(dof)[known]
+                         / np.where(usual > 0, usual, np.nan))
+    return out
 
 
 def _add_leak(table, leak, solved):

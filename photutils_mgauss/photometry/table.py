@@ -149,7 +149,7 @@ def define_flags(result, fit_shape, data_shape):
     def mark(where, bit):
         flags[where] |= bit
 
-    mark(result.n_pixels < fit_shape[0] * fit_shape[1], PARTIAL)
+    mark(result.n_pixels < result.shapes.prod(axis=1), PARTIAL)
     mark((x < -0.5) | (y < -0.5) | (x > width - 0.5) | (y > height - 0.5),
          OUTSIDE_IMAGE)
     mark(flux <= 0, NON_POSITIVE_FLUX)

@@ -129,9 +129,10 @@ class _Measure:
         return np.where(self.seen, away, 0).max(axis=(1, 2))
 
     def pulled(self, start, peak):
-        """Return the peaks (r, p), moved to within reach."""
-        return start + (peak - start) / np.maximum(
-            self.away(peak), 1)[:, None]
+        """Return the peaks (r, p), those beyond reach moved half inside."""
+        away = self.away(peak)
+        part = np.where(away > 1, 0.5 / np.maximum(away, 1), 1)
+        return start + (peak - start) * part[:, None]
 
     def __call__(self, places):
         """Return it for places (s, r, p)."""
@@ -206,10 +207,15 @@ class Fluxes:
 
 
 def _moments(places, weight):
-    """Return means (n, p) and mean squares of places (s, n, p)."""
-    weight = weight - weight.max(axis=0)
-    weight = np.exp(weight)
-    weight /= weight.sum(axis=0)
+    """
+    Return means (n, p) and mean squares of places (s, n, p).
+
+    NaN where no place has any weight.
+    """
+    largest = weight.max(axis=0)
+    weight = np.exp(weight - np.where(np.isfinite(largest), largest, 0))
+    total = weight.sum(axis=0)
+    weight /= np.where(total > 0, total, np.nan)
     mean = np.einsum('sn,sni->ni', weight, places)
     away = places - mean
     return mean, np.einsum('sn,sni,snj->nij', weight, away, away,

@@ -1,15 +1,19 @@
 """The origin of a PSF: the centre of its core, or the flux centroid."""
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import Table
 from numpy.testing import assert_allclose
+from photutils.background import Background2D
 
 from photutils_mgauss import (
     EmpiricalPSF,
     GaussianMixture,
     GriddedMixturePSF,
     MixtureField,
+    MixturePSFPhotometry,
     fit_mixture_field,
+    select_psf_stars,
 )
 from photutils_mgauss.psf.centre import centres
 
@@ -164,3 +168,26 @@ def test_another_word_for_the_centre_is_refused():
     data, error, stars = image(5)
     with pytest.raises(ValueError, match="centre must be one of 'core'"):
         fit_mixture_field(data, stars, error=error, centre='peak')
+
+
+def test_two_halves_of_a_real_image_have_one_centre(realdata):
+    path = realdata('spitzer_glimpse') / 'spitzer_example_image.fits'
+    data = fits.getdata(path).astype(float)
+    mask = ~np.isfinite(data)
+    sky = Background2D(data, 32, mask=mask)
+    data = data - sky.background
+    error = np.sqrt(sky.background_rms_median**2
+                    + 0.05 * np.maximum(np.nan_to_num(data), 0))
+    stars = select_psf_stars(data, error=error, mask=mask, radius=5)
+    bright = stars[stars['selected']]['x', 'y', 'flux']
+    found = []
+    for half in (stars['x'] < 512, stars['x'] >= 512):
+        some = stars.copy()
+        some['selected'] &= half
+        field = fit_mixture_field(data, some, error=error, mask=mask,
+                                  n_components=3, degree=0, radius=5,
+                                  local_bkg=True)
+        table = MixturePSFPhotometry(field, 5, correlated_noise=False)(
+            data, error=error, mask=mask, init_params=bright)
+        found.append(np.column_stack([table['x_fit'], table['y_fit']]))
+    assert np.abs(np.nanmedian(found[1] - found[0], axis=0)).max() < 0.05

@@ -238,6 +238,7 @@ def test_the_slope_of_chi2_is_the_right_side_of_the_equations():
         stamps, np.ones(data.shape), basis, sources, sources.copy(),
         np.full(sources.shape, 0.01), np.array([2, 1, 1]), np.zeros(3), True,
         np.ones(3, bool), np.zeros(3, int), FreeShapes(), np.zeros((3, 3)),
+        np.zeros((3, 0)),
         pixel_integrated=True)
     coefficients = rng.normal(0, 0.1, (2, 2, 6))
     coefficients[:, 0, :3] = 0

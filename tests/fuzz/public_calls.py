@@ -275,7 +275,8 @@ def motions_of_pixels():
                        for year in (2020.0, 2021.0)],
             'stars': places(), 'parallax': False, 'acceleration': False,
             'references': None, 'fit_shape': 11, 'fit_sky': True,
-            'forced': False, 'progress_bar': False, 'flux': 'image'}),
+            'forced': False, 'progress_bar': False, 'flux': 'image',
+            'reach': 0.75, 'refine_frames': False}),
     }
 
 

@@ -121,3 +121,27 @@ def test_scale_and_floor_of_known_residuals(rng):
     half = fit_error_scale(magnitude, residuals / np.sqrt(2), stated,
                            np.full(n, 1.0))  # half of it was fitted away
     assert_allclose(half.floor, 0.5, rtol=0.1)
+
+
+def test_renormalised_errors_are_one_at_every_magnitude(rng):
+    epochs, _, magnitude = seen(rng)
+    stars = ProperMotionFitter(systematic=None, clip=None).fit(epochs).stars
+    mag = magnitude[np.asarray(stars['id'])]
+    bright, faint = mag < 16.5, mag > 20.5
+    assert np.median(stars['uwe'][bright]) < 0.8
+    for some in (bright, faint, (mag > 18) & (mag < 19)):
+        assert_allclose(np.median(stars['ruwe'][some]), 1, atol=0.12)
+
+
+def test_an_acceleration_has_the_significance_of_its_chi_square(rng):
+    epochs, _, _ = seen(rng, n=40, factor=np.ones_like)
+    for epoch in epochs:
+        epoch.table['x_fit'][3] += 0.02 * (epoch.mean_year - 2015)**2
+    stars = ProperMotionFitter(acceleration=True, clip=None,
+                               transform='shift').fit(epochs).stars
+    row = stars[3]
+    alone = np.hypot(row['accra'] / row['accra_error'],
+                     row['accdec'] / row['accdec_error'])
+    assert_allclose(row['acc_significance'], alone, rtol=0.01)
+    assert row['acc_significance'] > 10
+    assert np.median(stars['acc_significance']) < 3

@@ -217,6 +217,30 @@ def test_covariances_between_stars_are_those_of_the_table(rng):
     assert_allclose(np.sqrt(np.diag(covariance)), errors, rtol=1e-8)
 
 
+def test_the_error_of_the_radial_velocity_is_in_those_of_later(rng):
+    """As much as places in 2080 change by a velocity off by its error."""
+    seed, sigma = rng.integers(2**30), 2.0
+    found = {}
+    for name, velocity, error in (('without', -110.47, None),
+                                  ('more', -110.47 + sigma, None),
+                                  ('with', -110.47, sigma)):
+        more = {} if error is None else {'radial_velocity_error': error}
+        epochs = barnard_epochs(np.random.default_rng(seed), n_qso=30,
+                                radial_velocity=velocity, **more)
+        solution = ProperMotionFitter(
+            parallax=True, match_by='id', ref_epoch=2080.0,
+            references='qso').fit(epochs)
+        found[name] = solution
+    dec, error = ({name: one.stars[column][0].to_value(u.mas)
+                   for name, one in found.items()}
+                  for column in ('dec', 'dec_error'))
+    added = np.sqrt(error['with']**2 - error['without']**2)
+    assert_allclose(added, abs(dec['more'] - dec['without']), rtol=0.1)
+    assert_allclose(dec['with'], dec['without'], atol=1e-6)
+    covariance = found['with'].covariance([1])[0, :, 0]
+    assert_allclose(np.sqrt(covariance[1, 1]), error['with'], rtol=1e-6)
+
+
 def test_radial_velocities_without_parallaxes_are_said_not_to_count(rng):
     epochs = barnard_epochs(rng, n_qso=30, radial_velocity=-110.47)
     solution = ProperMotionFitter(

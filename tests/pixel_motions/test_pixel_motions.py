@@ -235,6 +235,16 @@ def test_a_faint_star_is_the_mean_of_its_probability(rng):
     assert_allclose(stated, error, rtol=0.1)
 
 
+@pytest.mark.parametrize('reach', [1e-3, 0.2, 50])
+def test_faint_stars_have_numbers_however_far_they_may_be(rng, reach):
+    x, y = (a.ravel() for a in np.meshgrid([15, 36.0], [15, 36.0]))
+    images = observe(truth(x, y), [0.0, 15, 30, 60], YEARS, rng)
+    table = PixelMotionFitter(reach=reach).fit(
+        images, truth(x + 2, y - 1)['ra', 'dec']).stars
+    assert np.isfinite(errors(table)[:, :4]).all()
+    assert (errors(table)[:, :4] > 0).all()
+
+
 def test_a_star_that_is_surely_beyond_reach_is_where_it_is(rng):
     star, beside = truth(30.2, 29.6), truth(33.0, 29.6)
     images = observe(star, 120.0, YEARS, rng)

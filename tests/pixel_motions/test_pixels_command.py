@@ -71,7 +71,8 @@ def test_the_page_shows_a_faint_star_and_the_gain(folder):
     for name in NIGHTS:
         (frames / f'{name}_wcs.asdf').write_bytes(
             (folder / f'{name}_wcs.asdf').read_bytes())
-    assert run(folder, '--output', out, '--frames', frames) in (0, None)
+    assert run(folder, '--output', out, '--frames', frames,
+               '--refine-frames') in (0, None)
     page = folder / 'page.html'
     assert main(['report', str(out), '--output', str(page)]) in (0, None)
     words = page.read_text()
@@ -100,7 +101,9 @@ def test_places_given_are_kept_and_results_too(folder):
 
 
 @pytest.mark.parametrize(('options', 'words'), [
-    (['--forced'], '--targets'), (['--frames', 'nowhere'], '--frames'),
+    (['--forced'], '--targets'),
+    (['--forced', '--targets', 'x.ecsv', '--refine-frames'], 'without'),
+    (['--frames', 'nowhere'], '--frames'),
     (['--plane'], '--plane'), (['--targets', 'nowhere.ecsv'], 'nowhere')])
 def test_wrong_options_are_told(folder, options, words, capsys):
     try:

@@ -1,0 +1,50 @@
+"""The level of saturation on the command line and in headers."""
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import QTable
+
+from photutils_mgauss import GaussianMixture, GriddedMixturePSF
+from photutils_mgauss.cli import main
+
+MIXTURE = GaussianMixture([0.7, 0.3], [(0, 0), (0, 0)],
+                          [[[0.9, 0.1], [0.1, 0.8]], [[4, 0], [0, 4]]])
+X, Y, FULL = 40.3, 51.8, 2e4
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('saturated')
+    GriddedMixturePSF([MIXTURE], [(0, 0)]).write(folder / 'psf.fits')
+    rng = np.random.default_rng(1)
+    light = 50 + sum(MIXTURE.render((100, 100), x, y, flux=flux)
+                     for x, y, flux in [(X, Y, 1e6), (70, 20, 3e4),
+                                        (20, 80, 2e4)])
+    data = np.minimum(rng.poisson(light), FULL)
+    header = fits.Header({'SATURATE': FULL, 'GAIN': 1.0})
+    fits.writeto(folder / 'header.fits', data, header)
+    del header['SATURATE']
+    fits.writeto(folder / 'plain.fits', data, header)
+    return folder
+
+
+@pytest.mark.parametrize(('image', 'options', 'source'), [
+    ('header', [], 'the header'),
+    ('plain', ['--saturation', '20000'], '--saturation'),
+    ('header', ['--crowded'], 'the header')])
+def test_a_saturated_star_is_measured_and_said(folder, capsys, image,
+                                               options, source):
+    name = f'{image}_{len(options)}_{"--crowded" in options}.ecsv'
+    output = folder / name
+    main(['photometry', str(folder / f'{image}.fits'), '--psf',
+          str(folder / 'psf.fits'), '--output', str(output), *options])
+    said = capsys.readouterr()
+    assert f'pixels from 20000 on are saturated, as {source} says' in (
+        said.out + said.err)
+    assert 'from their wings' in said.out + said.err
+    table = QTable.read(output)
+    near = np.hypot(table['x_fit'] - X, table['y_fit'] - Y) < 8
+    assert near.sum() == 1 or options == ['--crowded']
+    star = table[near][np.argmax(table['flux_fit'][near])]
+    assert np.hypot(star['x_fit'] - X, star['y_fit'] - Y) < 0.05
+    assert star['flags'] & 65536
