@@ -1,5 +1,6 @@
 """The stars of one crowded field in many images: from images to the table."""
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,33 +20,50 @@ from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.checkpoint import Checkpoint
 
 
-def fit_images(photometry, images, listed, *, motions):
+class Settings(NamedTuple):
+    """
+    What `CrowdedMixturePhotometry` knows.
+
+    ``options_of`` returns the `TileOptions` of a `PixelData`, ``model_of`` the
+    PSF of one that comes without; the others are as of the class.
+    """
+
+    options_of: object
+    model_of: object
+    bound: float
+    tile_shape: tuple | None
+    overlap: int
+    executor: object
+    progress_bar: bool
+    checkpoint: Checkpoint
+
+
+def fit_images(images, listed, settings, *, motions):
     """
     Return the table of all images, what is unfinished, and errors.
 
     Parameters
     ----------
-    photometry : CrowdedMixturePhotometry
-        Whose settings are used.
     images, listed, motions
-        As of its method `fit_images`.
+        As of the method of `CrowdedMixturePhotometry`.
+    settings : Settings
     """
     field = read_field(images)
     given = None
     if listed is not None:
         u, v = grid_positions(listed, field.grid)
         given = Stars(u, v, np.zeros(u.size), number=np.arange(u.size),
-                      bound=photometry.bound)
-    each = [photometry.options_of(one) for one in field.pixels]
+                      bound=settings.bound)
+    each = [settings.options_of(one) for one in field.pixels]
     plan = ManyPlan(
-        field.pixels, _psfs(photometry, field),
+        field.pixels, _psfs(settings, field),
         # What is known of fluxes and places is said once for all images.
         [replace(one, count_slope=0.0) for one in each],
         replace(each[0], gain=None), field.grid,
-        np.ones(len(each)), _factors(field, motions), photometry.tile_shape,
-        photometry.overlap, given,
-        Checkpoint(photometry.checkpoint)).with_scales()
-    outcomes, errors = run(plan, photometry.executor, photometry.progress_bar)
+        np.ones(len(each)), _factors(field, motions), settings.tile_shape,
+        settings.overlap, given,
+        settings.checkpoint).with_scales()
+    outcomes, errors = run(plan, settings.executor, settings.progress_bar)
     left = [core for core, outcome in zip(plan.cores, outcomes, strict=True)
             if outcome is None]
     return _table(plan, outcomes, field), left, errors
@@ -59,8 +77,8 @@ def _factors(field, motions):
     return factors
 
 
-def _psfs(photometry, field):
-    return [LocalPSF.of(photometry.model_of(pixels) if psf is None else psf)
+def _psfs(settings, field):
+    return [LocalPSF.of(settings.model_of(pixels) if psf is None else psf)
             for psf, pixels in zip(field.psfs, field.pixels, strict=True)]
 
 

@@ -274,7 +274,7 @@ class CrowdedMixturePhotometry:
         given = (None if init_params is None
                  else self._listed(init_params, image.unit))
         psf = self._psf_of(image)
-        options = self.options_of(image)
+        options = self._options(image)
         plan = Plan(image, psf, options, self.tile_shape, self.overlap,
                     given, self._checkpoint)
         outcomes, errors = run(plan, self.executor, self.progress_bar)
@@ -353,9 +353,11 @@ class CrowdedMixturePhotometry:
         >>> len(table), table['flux'].shape
         (1, (1, 2))
         """
-        from photutils_mgauss.crowded.many_images import fit_images
-        table, unfinished, errors = fit_images(self, images, stars,
-                                               motions=motions)
+        from photutils_mgauss.crowded.many_images import Settings, fit_images
+        table, unfinished, errors = fit_images(images, stars, Settings(
+            self._options, self._model_of, self._bound, self.tile_shape,
+            self.overlap, self.executor, self.progress_bar,
+            self._checkpoint), motions=motions)
         if unfinished:
             raise UnfinishedTilesError(unfinished, table) from errors[0]
         return table
@@ -364,9 +366,9 @@ class CrowdedMixturePhotometry:
         """Return the PSF of an image, made of its stars if none is known."""
         if self._psf is not None:
             return self._psf
-        return LocalPSF.of(self.model_of(image))
+        return LocalPSF.of(self._model_of(image))
 
-    def model_of(self, image):
+    def _model_of(self, image):
         """Return the PSF model, made of an image's stars if none is known."""
         if self.psf_model is not None:
             return self.psf_model
@@ -404,14 +406,14 @@ class CrowdedMixturePhotometry:
 
     def _listed(self, init_params, unit):
         x, y, flux, number = _given(init_params, unit)
-        return Stars(x, y, flux, number=number, bound=self.bound)
+        return Stars(x, y, flux, number=number, bound=self._bound)
 
     @property
-    def bound(self):
+    def _bound(self):
         """How far a listed star may be from its place [pix]."""
         return np.inf if self.xy_bounds is None else self.xy_bounds
 
-    def options_of(self, image):
+    def _options(self, image):
         """Return the `TileOptions` of a `PixelData` with errors."""
         _, variance = image.sample()
         gain = self.effective_gain
@@ -426,7 +428,7 @@ class CrowdedMixturePhotometry:
             floor=float(variance.min()),
             noise=float(np.sqrt(np.median(variance))),
             max_rounds=self.maxiters, find_neighbors=self.find_neighbors,
-            xy_bounds=self.bound,
+            xy_bounds=self._bound,
             depth=self.depth, count_slope=self.count_slope,
             confusion=self.confusion)
 
