@@ -50,7 +50,7 @@ _ERRORS = _BIN * (np.arange(_SIZE) - _ZERO)
 # No more than this part of a star's flux is taken for that of hidden ones.
 _LARGEST_PART = 0.5
 # Of what fluxes would answer to the light that the background has taken, this
-# is what they do: artificial stars say so. Where the background is too high
+# is what they do: simulated fields say so. Where the background is too high
 # for one star others hide light beside it.
 _SHARE = 0.4
 _WITHIN_ONE = 0.6826894921370859

@@ -37,8 +37,8 @@ __all__ = ['CrowdedMixturePhotometry']
 # A PSF whose size is off by more than this fraction is warned of.
 _WIDTH_TOLERANCE = 0.1
 _CONFUSION = ('errors and fluxes allow for stars that were not found; what of '
-              'their light the background takes is calibrated with artificial '
-              'stars')
+              'their light the background takes is calibrated on simulated '
+              'fields')
 # Stars are drawn out to where this fraction of the noise is left of them.
 _FAINTEST = 1e-3
 
