@@ -207,7 +207,11 @@ def _fwhm(psf, shape):
     """Return the width of the PSF in the middle of the image [pix]."""
     from photutils_mgauss.psf.shapes import adaptive_moments
     ny, nx = shape
-    return float(adaptive_moments(psf.mixture_at(nx / 2, ny / 2)).fwhm)
+    mixture = psf.mixture_at(nx / 2, ny / 2)
+    if psf.pixel_integrated:
+        # Images show the optics and the pixel.
+        mixture = mixture.convolve([[1 / 12, 0], [0, 1 / 12]])
+    return float(adaptive_moments(mixture).fwhm)
 
 
 def _with_unit(table, unit):

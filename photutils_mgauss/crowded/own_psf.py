@@ -15,7 +15,7 @@ __all__ = ['fit_crowded_psf']
 def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
                     n_components=6, degree='auto', radius=15, max_stars=300,
                     min_snr=50, saturation=None, effective_gain=None,
-                    background_size=64, max_passes=8, executor=None,
+                    background_size=64, max_passes=12, executor=None,
                     checkpoint=None, progress_bar=False):
     """
     Fit the PSF of a crowded image and its stars in turns.

@@ -55,7 +55,7 @@ class LoopOptions:
     rules: psf_stars.Rules = field(default_factory=psf_stars.Rules)
     n_components: int = 6
     degree: object = 'auto'
-    max_passes: int = 8
+    max_passes: int = 12
     progress_bar: bool = False
 
     def radius(self, number):

@@ -62,7 +62,7 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
                       effective_gain=None, reject=True, regularization=None,
                       start=None, centre='core', normalise='auto',
                       pixel_integrated='auto', correlated_noise=True,
-                      contexts=(), brighter_fatter='auto', executor=None):
+                      contexts=(), brighter_fatter=False, executor=None):
     """
     Fit a PSF field to the pixels of stars.
 
@@ -163,12 +163,13 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         Columns of ``stars``, as ``('colour',)``, on which the shapes depend
         linearly, beside position. A star for which one is unknown (masked or
         NaN) has the mean of the others. Not with ``start``.
-    brighter_fatter : 'auto' or bool, optional
+    brighter_fatter : bool or 'auto', optional
         Whether each unit of flux adds a covariance to all Gaussians, because
-        charge repels charge. By default that is so if the stars say so
+        charge repels charge. With 'auto' that is so if the stars say so
         beyond doubt, and a warning tells it; otherwise the field does not
-        change. ``field.mixture_at(x, y)`` is then the PSF of faint stars,
-        that of others needs their ``flux``. Not with ``start``.
+        change. What the Gaussians cannot describe may look alike, so that it
+        is off by default. ``field.mixture_at(x, y)`` is then the PSF of faint
+        stars, that of others needs their ``flux``. Not with ``start``.
     executor : `~concurrent.futures.Executor`, optional
         Where stars are worked on; by default a pool of threads.
 

@@ -1,8 +1,8 @@
 """Names that a package hands on and loads when they are first used."""
+import sys
 from importlib import import_module
-
-from astropy.io import registry
-from astropy.table import Table
+from importlib.abc import MetaPathFinder
+from importlib.util import find_spec
 
 
 def hand_on(package, owners):
@@ -53,6 +53,45 @@ def offer_formats(names, owner, reader):
             return getattr(import_module(owner), reader)(file, name,
                                                          **options)
         return read
-    for name in names:
-        registry.register_reader(f'mgauss.{name}', Table, later(name),
-                                 force=True)
+
+    def register():
+        from astropy.io import registry
+        from astropy.table import Table
+        for name in names:
+            registry.register_reader(f'mgauss.{name}', Table, later(name),
+                                     force=True)
+    when_imported('astropy.table', register)
+
+
+def when_imported(name, function):
+    """
+    Call a function once a module is there, now or whenever it is imported.
+
+    The module is not imported for that: help of the command line comes
+    without waiting for packages that it does not need.
+    """
+    if name in sys.modules:
+        function()
+    else:
+        sys.meta_path.insert(0, _Watch(name, function))
+
+
+class _Watch(MetaPathFinder):
+    """Waits for the import of one module, and calls a function after it."""
+
+    def __init__(self, name, function):
+        self._name, self._function = name, function
+
+    def find_spec(self, name, path, target=None):
+        """Find the module for which this waits, and no other."""
+        if name != self._name:
+            return None
+        sys.meta_path.remove(self)
+        spec = find_spec(name)
+        run = spec.loader.exec_module
+
+        def run_and_tell(module):
+            run(module)
+            self._function()
+        spec.loader.exec_module = run_and_tell
+        return spec

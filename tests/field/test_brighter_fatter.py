@@ -48,8 +48,9 @@ def image(added, seed):
 
 def fit(given, **options):
     data, error, stars = given
-    return fit_mixture_field(data, stars, error=error, n_components=2,
-                             degree=1, radius=10, **options)
+    return fit_mixture_field(
+        data, stars, error=error, n_components=2, degree=1, radius=10,
+        **{'brighter_fatter': 'auto', **options})
 
 
 @pytest.fixture(scope='module')
@@ -168,7 +169,7 @@ def test_repulsion_in_silicon_is_found():
         field = fit_mixture_field(
             scene.image - scene.background,
             QTable({'x': x, 'y': y, 'flux': flux}), error=scene.error,
-            n_components=3, degree=0)
+            n_components=3, degree=0, brighter_fatter='auto')
     # What silicon does to stars in the middle of pixels, on other images.
     levels = 1e4, 1.5e5
     sizes = []
