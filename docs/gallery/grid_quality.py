@@ -46,7 +46,6 @@ maps, worst = axes
 plot_node_map(psfs[3], 'size_error', ax=maps[0])
 plot_node_map(psfs[3], 'phase_error', ax=maps[1])
 plot_whiskers(psfs[3], ax=maps[2])
-maps[2].set_title('ellipticity')
 for ax in maps:
     ax.set_title(ax.get_title().replace(': ', '\n'), fontsize='medium')
 for ax, (k, psf) in zip(worst, psfs.items(), strict=True):

@@ -36,5 +36,4 @@ for ax, transform in zip(axes, ('shift', 'poly-3'), strict=True):
         transform=transform, references=quasars, systematic=None,
         clip=None).fit(epochs)
     plot_residual_vectors(solution, 1, ax=ax)
-    ax.set_title(f"transform='{transform}'\n{ax.get_title()}",
-                 fontsize='medium')
+    ax.set_title(f"transform='{transform}'", loc='left', fontsize='medium')
