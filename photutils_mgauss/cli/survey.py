@@ -77,8 +77,10 @@ def run(options):
 
 def _write_example(options):
     folder = Path(options.init)
-    images = sorted(path for pattern in ('*.fits', '*.fits.*', '*.asdf')
+    images = sorted(path for pattern in ('*.fits', '*.fits.*')
                     for path in folder.glob(pattern))
+    # Beside FITS images ASDF files hold their WCS.
+    images = images or sorted(folder.glob('*.asdf'))
     if not images:
         msg = f'{folder}: must have images (*.fits, *.asdf), got none'
         raise ValueError(msg)

@@ -16,7 +16,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-from astropy.io import fits
 from astropy.table import QTable
 
 from photutils_mgauss import (
@@ -42,15 +41,7 @@ def write_images(folder, n_fields, n_epochs, size):
                                  instrument=Instrument(shape=(size, size)),
                                  rng=k)
         for number, scene in enumerate(scenes):
-            header = scene.wcs.to_fits_sip(
-                bounding_box=((-0.5, size - 0.5), (-0.5, size - 0.5)))
-            header['MJD-AVG'], header['BUNIT'] = scene.time.mjd, 'electron'
-            fits.HDUList([
-                fits.PrimaryHDU(),
-                fits.ImageHDU(scene.image.astype('f4'), header, name='SCI'),
-                fits.ImageHDU(scene.error.astype('f4'), name='ERR'),
-                fits.ImageHDU(scene.mask.astype('i2'), name='DQ'),
-            ]).writeto(folder / f'field{k}_{number}.fits')
+            scene.write(folder / f'field{k}_{number}.fits')
 
 
 def run_survey(folder, name, workers, pattern='*'):
