@@ -205,12 +205,14 @@ def _own_psf(image, options):
 
 def _fwhm(psf, shape):
     """Return the width of the PSF in the middle of the image [pix]."""
+    from photutils_mgauss.field.stages import PIXEL_VARIANCE
     from photutils_mgauss.psf.shapes import adaptive_moments
     ny, nx = shape
     mixture = psf.mixture_at(nx / 2, ny / 2)
     if psf.pixel_integrated:
         # Images show the optics and the pixel.
-        mixture = mixture.convolve([[1 / 12, 0], [0, 1 / 12]])
+        mixture = mixture.convolve([[PIXEL_VARIANCE, 0],
+                                    [0, PIXEL_VARIANCE]])
     return float(adaptive_moments(mixture).fwhm)
 
 

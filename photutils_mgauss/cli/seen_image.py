@@ -10,7 +10,7 @@ from photutils_mgauss.cli.star_image import Reading, read_image
 from photutils_mgauss.simulation.scene import render_stars
 from photutils_mgauss.utils.star_columns import column_values
 
-# Larger images are shown from their middle [pix].
+# Larger images are not shown: their stars would be specks [pix].
 _LARGEST = 800
 
 

@@ -18,7 +18,7 @@ from photutils_mgauss.kernels.crowded_search import (
     template_products,
 )
 from photutils_mgauss.kernels.jit import inner, kernel
-from photutils_mgauss.kernels.linear import cholesky
+from photutils_mgauss.kernels.linear import cholesky, solve_factored
 
 # The covariance of a star is that with so many stars free, itself included.
 MOST_TOGETHER = 9
@@ -278,14 +278,7 @@ def invert_places(together):
         for a in range(size):
             for b in range(size):
                 column[b] = 1.0 if a == b else 0.0
-            for b in range(size):
-                for c in range(b):
-                    column[b] -= factor[b, c] * column[c]
-                column[b] /= factor[b, b]
-            for b in range(size - 1, -1, -1):
-                for c in range(b + 1, size):
-                    column[b] -= factor[c, b] * column[c]
-                column[b] /= factor[b, b]
+            solve_factored(factor, size, column)
             for b in range(size):
                 together.free[i, a, b] = (column[b] * scale[a] * scale[b]
                                           if solved else np.nan)
