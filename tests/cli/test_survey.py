@@ -2,6 +2,11 @@
 import json
 import os
 import re
+import subprocess
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +22,6 @@ from photutils_mgauss import (
 from photutils_mgauss.cli import main
 from photutils_mgauss.cli.survey_plan import read_survey
 from photutils_mgauss.cli.survey_run import (
-    Outcome,
     Task,
     kept_outcome,
     local_workers,
@@ -194,21 +198,75 @@ def test_a_task_runs_once_until_something_it_reads_changes(tmp_path):
         'gone', (), (str(tmp_path / 'gone'),), (), 'x')).error.lower()
 
 
-def _kill_once(task):
-    """Take the process down, the first time."""
-    mark = task.record + '.mark'
-    if not os.path.exists(mark):  # noqa: PTH110
-        with open(mark, 'w'):  # noqa: PTH123
-            os.kill(os.getpid(), 9)
-    return Outcome(task.name, seconds=1.0)
+@pytest.fixture
+def light(monkeypatch):
+    """Return the module that processes can import quickly."""
+    folder = str(Path(__file__).parent)
+    monkeypatch.syspath_prepend(folder)
+    return import_module('stand_ins')
 
 
-def test_a_worker_that_dies_loses_nothing(tmp_path, monkeypatch):
+def test_a_worker_that_dies_loses_nothing(tmp_path, monkeypatch, light):
     from photutils_mgauss.cli import survey_run
-    monkeypatch.setattr(survey_run, 'run_task', _kill_once)
+    monkeypatch.setattr(survey_run, 'run_task', light.kill_once)
     tasks = [make_task(tmp_path, f'task{k}') for k in range(3)]
     told = []
     done = run_tasks(tasks, local_workers(2), told.append)
     assert sorted(done) == ['task0', 'task1', 'task2']
     assert not any(outcome.error for outcome in done.values())
     assert len(told) == 3
+
+
+def begin(folder, n):
+    """Start a driver of n tasks."""
+    return subprocess.Popen([sys.executable, str(
+        Path(__file__).with_name('stand_ins.py')), str(folder), str(n)])
+
+
+def wait_until(true, seconds=60):
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def is_gone(pid):
+    try:
+        return 'Z' in Path(f'/proc/{pid}/stat').read_text().split()[2]
+    except OSError:
+        return True
+
+
+def test_what_is_killed_repeats_one_task_each(tmp_path, light):
+    n, kills = 14, 0
+    driver = begin(tmp_path, n)
+    # A worker, in the middle of a task: only its own is done again.
+    wait_until(lambda: len(light.notes(tmp_path)) >= 3)
+    os.kill(int(light.notes(tmp_path)[-1][1]), 9)
+    kills += 1
+    # The driver: its two workers end with it.
+    wait_until(lambda: len(light.notes(tmp_path)) >= 7)
+    driver.kill()
+    driver.wait()
+    kills += 2
+    wait_until(lambda: all(is_gone(pid) for _, pid in light.notes(tmp_path)))
+    known = list((tmp_path / 'records').glob('t*.json'))
+    assert 2 < len(known) < n
+    before = {path: path.stat().st_mtime_ns for path in known}
+    assert begin(tmp_path, n).wait() == 0
+    assert len(list((tmp_path / 'records').glob('t*.json'))) == n
+    begun = [name for name, _ in light.notes(tmp_path)]
+    assert len(set(begun)) == n
+    assert len(begun) <= n + kills
+    # What had a record was not done again.
+    assert before == {path: path.stat().st_mtime_ns for path in known}
+
+
+def test_processes_share_the_cores(monkeypatch):
+    from photutils_mgauss.utils import parallel
+    monkeypatch.setattr(parallel, '_LIMIT', {})
+    cores = parallel.available_cores()
+    parallel.limit_cores(1)
+    assert parallel.available_cores() == 1
+    parallel.limit_cores(cores + 1)
+    assert parallel.available_cores() == cores
