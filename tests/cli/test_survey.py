@@ -20,6 +20,7 @@ from photutils_mgauss import (
     sky_field,
 )
 from photutils_mgauss.cli import main
+from photutils_mgauss.cli.psf_files import psf_record
 from photutils_mgauss.cli.survey_plan import read_survey
 from photutils_mgauss.cli.survey_run import (
     Task,
@@ -270,3 +271,39 @@ def test_processes_share_the_cores(monkeypatch):
     assert parallel.available_cores() == 1
     parallel.limit_cores(cores + 1)
     assert parallel.available_cores() == cores
+
+
+def test_detectors_and_pixels_are_steps_of_a_survey(images, tmp_path, capsys):
+    pytest.importorskip('pyarrow')
+    path = tmp_path / 'survey.toml'
+    path.write_text(
+        (f'[exposures]\nfiles = "{images}/raw/north*.fits"\n{OPTIONS}'
+         'pixels = true\ntargets = "quasars.ecsv"\n[photometry]\n'
+         'psf = "detector"\n').replace('quasars', f'{images}/quasars')
+        .replace('n_components = 1', 'n_components = 3'))
+    assert main(['survey', str(path), '--workers', '1']) == 0, (
+        capsys.readouterr().err)
+    folder = tmp_path / 'survey'
+    psfs = sorted((folder / 'psfs').rglob('*.fits'))
+    assert [one.name for one in psfs] == ['north0_psf.fits',
+                                          'north1_psf.fits']
+    # One fit, and a width of each exposure.
+    records = [psf_record(one) for one in psfs]
+    assert [one['exposures'] for one in records] == [2, 2]
+    tables = [QTable.read(folder / what / 'field0001' / 'motions.ecsv')
+              for what in ('motions', 'pixels')]
+    for table in tables:
+        assert np.isfinite(table['pmra_error'].value).sum() > 20
+    assert tables[1]['significance'].max() > 50
+    # The frames of the pixels are those of the catalogues.
+    record = tables[1].meta['mgauss']
+    assert sorted(Path(one).stem for one in record['options']['wcs']) == [
+        'north0_wcs', 'north1_wcs']
+    assert record['catalogues']['motions'] > 20
+    assert sorted(one.stem for one in (folder / 'wcs').iterdir()) == [
+        'north0_wcs', 'north1_wcs']
+    assert 'field0001_pixels' in (folder / 'index.html').read_text()
+    before = stamps(folder)
+    assert main(['survey', str(path), '--workers', '1']) == 0
+    assert '0 failed, 5 of an earlier run' in capsys.readouterr().out
+    assert stamps(folder) == before
