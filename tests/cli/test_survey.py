@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable, vstack
+from numpy.testing import assert_array_equal
 
 from photutils_mgauss import (
+    GaussianMixture,
+    GriddedMixturePSF,
     Instrument,
     paper_exposures,
     simulate_epochs,
@@ -307,3 +310,27 @@ def test_detectors_and_pixels_are_steps_of_a_survey(images, tmp_path, capsys):
     assert main(['survey', str(path), '--workers', '1']) == 0
     assert '0 failed, 5 of an earlier run' in capsys.readouterr().out
     assert stamps(folder) == before
+
+
+def test_results_are_the_same_whoever_makes_them(images, tmp_path, capsys):
+    pytest.importorskip('pyarrow')
+    from pyarrow import dataset
+    mixture = GaussianMixture([1.0], [[0, 0]], [np.eye(2)])
+    GriddedMixturePSF([mixture], [[0, 0]]).write(tmp_path / 'psf.fits')
+    found = []
+    for workers in ('1', '2'):
+        path = tmp_path / f'{workers}.toml'
+        path.write_text(
+            f'output = "out{workers}"\n[exposures]\nfiles = "{images}/raw/'
+            f'south*.fits"\n[photometry]\npsf = "psf.fits"\n[motions]\n'
+            f'references = "{images}/quasars.ecsv"\n')
+        assert main(['survey', str(path), '--workers', workers]) == 0, (
+            capsys.readouterr().err)
+        found.append(dataset.dataset(
+            tmp_path / f'out{workers}' / 'motions_hats' / 'dataset',
+            format='parquet').to_table())
+    assert found[0].num_rows > 40
+    assert found[0].schema.equals(found[1].schema, check_metadata=True)
+    for name in found[0].column_names:
+        # NaN included.
+        assert_array_equal(*(one[name].to_numpy() for one in found), name)
