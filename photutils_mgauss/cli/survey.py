@@ -139,19 +139,16 @@ def _cost(survey, kept):
 
 
 def _run(options, survey):
-    from photutils_mgauss.cli import survey_tasks as tasks
     from photutils_mgauss.cli.survey_folder import mark_output
     from photutils_mgauss.cli.survey_run import cluster_workers, local_workers
     start = time.perf_counter()
     workers = (local_workers(options.workers) if options.cluster is None
                else cluster_workers(options.cluster))
     mark_output(survey)
-    psfs = _do(options, tasks.detector_tasks(survey), workers, 'detectors')
-    done = _do(options, tasks.exposure_tasks(survey), workers, 'exposures')
-    fields = _do(options, tasks.field_tasks(survey, _good(done)), workers,
-                 'fields')
-    pixels = _do(options, tasks.pixel_tasks(survey, _good(done),
-                                            _good(fields)), workers, 'pixels')
+    try:
+        psfs, done, fields, pixels = _all_steps(options, survey, workers)
+    finally:
+        workers.close()
     _finish(options, survey, psfs, done, fields, pixels,
             time.perf_counter() - start)
     if any(outcome.error for some in (psfs, done, fields, pixels)
@@ -159,6 +156,18 @@ def _run(options, survey):
         msg = (f'{survey.output / "index.html"} lists what failed; the rest '
                'is finished, and the same command tries again')
         raise RuntimeError(msg)
+
+
+def _all_steps(options, survey, workers):
+    """Return the outcomes of all tasks, step by step."""
+    from photutils_mgauss.cli import survey_tasks as tasks
+    psfs = _do(options, tasks.detector_tasks(survey), workers, 'detectors')
+    done = _do(options, tasks.exposure_tasks(survey), workers, 'exposures')
+    fields = _do(options, tasks.field_tasks(survey, _good(done)), workers,
+                 'fields')
+    pixels = _do(options, tasks.pixel_tasks(survey, _good(done),
+                                            _good(fields)), workers, 'pixels')
+    return psfs, done, fields, pixels
 
 
 def _good(outcomes):

@@ -184,10 +184,13 @@ class Workers:
         broke.
     number : int
         How many of them there are.
+    close : callable, optional
+        Called when all is done.
     """
 
     make: object
     number: int
+    close: object = lambda: None
 
 
 def local_workers(number):
@@ -245,7 +248,8 @@ def cluster_workers(address):
         raise ValueError(msg)
     # The same task may be asked for again after a failure; two for each
     # worker, so that the next one is there when one is done.
-    return Workers(lambda: client.get_executor(pure=False), 2 * number)
+    return Workers(lambda: client.get_executor(pure=False), 2 * number,
+                   client.close)
 
 
 def run_tasks(tasks, workers, tell):

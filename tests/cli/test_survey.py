@@ -27,6 +27,7 @@ from photutils_mgauss.cli.psf_files import psf_record
 from photutils_mgauss.cli.survey_plan import read_survey
 from photutils_mgauss.cli.survey_run import (
     Task,
+    cluster_workers,
     kept_outcome,
     local_workers,
     run_task,
@@ -334,3 +335,19 @@ def test_results_are_the_same_whoever_makes_them(images, tmp_path, capsys):
     for name in found[0].column_names:
         # NaN included.
         assert_array_equal(*(one[name].to_numpy() for one in found), name)
+
+
+def test_tasks_run_on_a_dask_cluster(tmp_path, light):
+    distributed = pytest.importorskip('distributed')
+    tasks = light.tasks_without_work(tmp_path, 6)
+    told = []
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1,
+                                  processes=False,
+                                  dashboard_address=None) as cluster:
+        workers = cluster_workers(cluster.scheduler_address)
+        done = run_tasks(tasks, workers, told.append)
+        again = run_tasks(tasks, workers, told.append)
+        workers.close()
+    assert workers.number == 2
+    assert not any(one.error or one.skipped for one in done.values())
+    assert all(one.skipped for one in again.values())
