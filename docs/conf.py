@@ -26,7 +26,9 @@ version = '.'.join(release.split('.')[:2])
 
 sys.path.insert(0, str(Path(__file__).parent))
 extensions.remove('sphinx.ext.todo')
-extensions += ['make_gallery', 'make_house']
+extensions.remove('sphinx.ext.mathjax')
+extensions += ['make_formulae', 'make_gallery', 'make_house']
+html_math_renderer = 'mathml'
 exclude_patterns = ['_build', '**.ipynb_checkpoints']
 html_title = f'{project} {release}'
 html_static_path = ['_static']
