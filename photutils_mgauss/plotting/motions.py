@@ -1,7 +1,13 @@
 """Figures of epochs and proper motions."""
 import numpy as np
 
-from photutils_mgauss.plotting.style import BLUE, ORANGE, current_axes
+from photutils_mgauss.plotting.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    ORANGE,
+    current_axes,
+)
 
 __all__ = [
     'plot_cutouts',
@@ -9,11 +15,17 @@ __all__ = [
     'plot_motion_errors',
     'plot_motions_by_magnitude',
     'plot_proper_motions',
+    'plot_reference_differences',
+    'plot_residual_map',
     'plot_residual_vectors',
 ]
 
+# Detections in a cell of a map of residuals, at least.
+_ENOUGH = 5
 
-def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
+
+def plot_residual_vectors(solution, epoch, *, scale=None, title=None,
+                          ax=None):
     """
     Draw the residuals of one epoch's references and stars as arrows.
 
@@ -26,6 +38,8 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     scale : float, optional
         Residual [mas] as long as a tenth of the field, which the key shows;
         the default is three times the median residual.
+    title : str, optional
+        What the epoch is called; the default is its number.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw; None is pyplot's current Axes.
 
@@ -51,11 +65,89 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     ax.update_datalim(np.column_stack([x + u / unit, y + v / unit])[good])
     ax.autoscale_view()
     ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal')
-    ax.set_title(f'epoch {epoch}', loc='left')
+    ax.set_title(f'epoch {epoch}' if title is None else title, loc='left')
     ax.invert_xaxis()
     ax.quiverkey(arrows, 0.85, 1.04, scale, f'{scale:.2g} {rows["dra"].unit}',
                  labelpos='W', color=BLUE)
     return ax
+
+
+def plot_residual_map(residuals, chip='', *, n_cells=6, scale=None, ax=None):
+    """
+    Draw the mean residuals in the cells of a detector as arrows.
+
+    What is the same in all exposures, such as a distortion that no WCS has,
+    stands out against the noise of single detections.
+
+    Parameters
+    ----------
+    residuals : `~astropy.table.QTable`
+        What `~photutils_mgauss.MotionSolution.detector_residuals` gives.
+    chip : str, optional
+        Name of the chip.
+    n_cells : int, optional
+        Cells along the longer side.
+    scale : float, optional
+        Residual [pix] as long as a cell, which the key shows; the default
+        is twice the median of the cells.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        Its Axes; arrows shorter than twice their error are grey.
+
+    Raises
+    ------
+    ValueError
+        If there are no residuals on such a chip.
+    """
+    ax = current_axes(ax)
+    places, mean, error, size = _cells(residuals, chip, n_cells)
+    length = np.hypot(*mean)
+    if scale is None:
+        scale = 2 * np.median(length)
+    clear = length > 2 * error
+    for which, colour in ((~clear, GREY), (clear, BLUE)):
+        arrows = ax.quiver(*places[:, which], *mean[:, which], color=colour,
+                           angles='xy', scale_units='xy', pivot='middle',
+                           scale=scale / size, width=0.004)
+    ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal')
+    ax.update_datalim(np.concatenate([(places - size / 2).T,
+                                      (places + size / 2).T]))
+    ax.autoscale_view()
+    ax.set_title(f'chip {chip}' if chip else '', loc='left')
+    ax.quiverkey(arrows, 0.85, 1.04, scale, f'{scale:.2g} pix', labelpos='W',
+                 color=BLUE)
+    return ax
+
+
+def _cells(residuals, chip, n_cells):
+    """Return places, means (2, c), errors (c,) and the size of the cells."""
+    names = ('x_pix', 'y_pix', 'dx_pix', 'dy_pix')
+    own = residuals[np.ma.filled(residuals['chip'], '') == chip]
+    x, y, dx, dy = (np.asarray(own[name].value) for name in names)
+    good = np.isfinite(x + y + dx + dy)
+    if not good.any():
+        msg = f'residuals must have some on chip {chip!r}, got none'
+        raise ValueError(msg)
+    x, y, dx, dy = (values[good] for values in (x, y, dx, dy))
+    size = max(np.ptp(x), np.ptp(y), 1e-6) / n_cells * 1.0001
+    column, row = ((values - values.min()) // size for values in (x, y))
+    _, cell, count = np.unique(column + n_cells * row, return_inverse=True,
+                               return_counts=True)
+    kept = count >= _ENOUGH
+
+    def mean(values):
+        return (np.bincount(cell, values) / count)[kept]
+
+    scatter = np.hypot(*(np.sqrt(np.maximum(
+        mean(values**2) - mean(values)**2, 0)) for values in (dx, dy)))
+    places = np.stack([values.min() + (mean(index) + 0.5) * size
+                       for values, index in ((x, column), (y, row))])
+    return (places, np.stack([mean(dx), mean(dy)]),
+            scatter / np.sqrt(count[kept] - 1), size)
 
 
 def _field_coordinates(rows):
@@ -116,6 +208,38 @@ def plot_proper_motions(stars, *, membership=None, ax=None):
 def _is_reference(stars):
     # A file gives the empty words of stars back as missing ones.
     return np.ma.filled(stars['reference'], '') != ''
+
+
+def plot_reference_differences(table, *, ax=None):
+    """
+    Plot the motions measured of references less those of their catalogue.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        What `~photutils_mgauss.MotionSolution.reference_differences` or
+        ``validation`` gives; rows with NaN are left out.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        Its Axes. If catalogue and errors are right, two thirds of the bars
+        of each direction reach the cross at zero.
+    """
+    ax = current_axes(ax)
+    for draw in (ax.axhline, ax.axvline):
+        draw(0, color=BLACK, linewidth=0.8)
+    names = ('dpmra', 'dpmdec', 'dpmdec_error', 'dpmra_error')
+    ax.errorbar(*(table[name].value for name in names), fmt='.',
+                color=ORANGE, alpha=0.5, elinewidth=0.5, markersize=3)
+    unit = table['dpmra'].unit
+    ax.set(xlabel=rf'$\Delta\mu_{{\alpha*}}$ [{unit}]',
+           ylabel=rf'$\Delta\mu_\delta$ [{unit}]', aspect='equal')
+    ax.set_title('measured minus catalogue', loc='left')
+    ax.invert_xaxis()
+    return ax
 
 
 def plot_motions_by_magnitude(stars, magnitude, *, ax=None):
