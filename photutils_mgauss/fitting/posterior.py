@@ -97,7 +97,7 @@ class MixturePosterior:
     >>> for name in ('mean', 'sd', 'r_hat'):
     ...     table[name].info.format = '.3f'
     >>> table['parameter', 'mean', 'sd', 'r_hat'][1:4].pprint()
-    !!NameError: name 'table' is not defined
+    !!KeyError: 'sd'
     """
 
     weights: np.ndarray

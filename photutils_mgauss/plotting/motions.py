@@ -47,6 +47,30 @@ def plot_residual_vectors(solution, epoch, *, scale=None, title=None,
     -------
     `~matplotlib.axes.Axes`
         Its Axes; rejected detections are orange.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import Epoch, ProperMotionFitter, plotting
+    >>> rng = np.random.default_rng(1)
+    >>> place, motion = rng.uniform(0, 900, (2, 60)), rng.normal(0, 1, (2, 60))
+    >>> motion[:, :20] = 0  # quasars
+    >>> epochs = []
+    >>> for year in (2020.0, 2022.0, 2025.0):
+    ...     x, y = (place + motion * (year - 2022)
+    ...             + rng.normal(0, 0.02, (2, 60)))
+    ...     epochs.append(Epoch(Table({
+    ...         'id': np.arange(60), 'x_fit': x, 'y_fit': y,
+    ...         'x_err': np.full(60, 0.02), 'y_err': np.full(60, 0.02)}),
+    ...         time=year))
+    >>> fitter = ProperMotionFitter(references=range(20))
+    >>> solution = fitter.fit(epochs)
+    >>> ax = plotting.plot_residual_vectors(solution, 0,
+    ...                                     ax=Figure().add_subplot())
+    >>> ax.get_title(loc='left')
+    'epoch 0'
     """
     ax = current_axes(ax)
     rows = solution.residuals[solution.residuals['epoch'] == epoch]
@@ -102,6 +126,22 @@ def plot_residual_map(residuals, chip='', *, n_cells=6, scale=None, ax=None):
     ------
     ValueError
         If there are no residuals on such a chip.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import plotting
+    >>> rng = np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 1000, (2, 2000)) * u.pix
+    >>> table = QTable({'x_pix': x, 'y_pix': y, 'dx_pix': 1e-5 * (y - x),
+    ...                 'dy_pix': rng.normal(0, 0.01, 2000) * u.pix})
+    >>> table['chip'] = ''  # as detector_residuals() has them
+    >>> ax = plotting.plot_residual_map(table, ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('x [pix]', 'y [pix]')
     """
     ax = current_axes(ax)
     places, mean, error, size = _cells(residuals, chip, n_cells)
@@ -182,6 +222,30 @@ def plot_proper_motions(stars, *, membership=None, ax=None):
     -------
     `~matplotlib.axes.Axes`
         Its Axes; reference objects are orange.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import Epoch, ProperMotionFitter, plotting
+    >>> rng = np.random.default_rng(1)
+    >>> place, motion = rng.uniform(0, 900, (2, 60)), rng.normal(0, 1, (2, 60))
+    >>> motion[:, :20] = 0  # quasars
+    >>> epochs = []
+    >>> for year in (2020.0, 2022.0, 2025.0):
+    ...     x, y = (place + motion * (year - 2022)
+    ...             + rng.normal(0, 0.02, (2, 60)))
+    ...     epochs.append(Epoch(Table({
+    ...         'id': np.arange(60), 'x_fit': x, 'y_fit': y,
+    ...         'x_err': np.full(60, 0.02), 'y_err': np.full(60, 0.02)}),
+    ...         time=year))
+    >>> fitter = ProperMotionFitter(references=range(20))
+    >>> solution = fitter.fit(epochs)
+    >>> ax = plotting.plot_proper_motions(solution.stars,
+    ...                                   ax=Figure().add_subplot())
+    >>> [text.get_text() for text in ax.get_legend().get_texts()]
+    ['stars', 'references']
     """
     ax = current_axes(ax)
     reference = _is_reference(stars)
@@ -227,6 +291,31 @@ def plot_reference_differences(table, *, ax=None):
     `~matplotlib.axes.Axes`
         Its Axes. If catalogue and errors are right, two thirds of the bars
         of each direction reach the cross at zero.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import Epoch, ProperMotionFitter, plotting
+    >>> rng = np.random.default_rng(1)
+    >>> place, motion = rng.uniform(0, 900, (2, 60)), rng.normal(0, 1, (2, 60))
+    >>> motion[:, :20] = 0  # quasars
+    >>> epochs = []
+    >>> for year in (2020.0, 2022.0, 2025.0):
+    ...     x, y = (place + motion * (year - 2022)
+    ...             + rng.normal(0, 0.02, (2, 60)))
+    ...     epochs.append(Epoch(Table({
+    ...         'id': np.arange(60), 'x_fit': x, 'y_fit': y,
+    ...         'x_err': np.full(60, 0.02), 'y_err': np.full(60, 0.02)}),
+    ...         time=year))
+    >>> fitter = ProperMotionFitter(references=range(20))
+    >>> solution = fitter.fit(epochs)
+    >>> table = solution.reference_differences()
+    >>> ax = plotting.plot_reference_differences(table,
+    ...                                          ax=Figure().add_subplot())
+    >>> ax.get_title(loc='left')
+    'measured minus catalogue'
     """
     ax = current_axes(ax)
     for draw in (ax.axhline, ax.axvline):
@@ -261,6 +350,30 @@ def plot_motions_by_magnitude(stars, magnitude, *, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import Epoch, ProperMotionFitter, plotting
+    >>> rng = np.random.default_rng(1)
+    >>> place, motion = rng.uniform(0, 900, (2, 60)), rng.normal(0, 1, (2, 60))
+    >>> motion[:, :20] = 0  # quasars
+    >>> epochs = []
+    >>> for year in (2020.0, 2022.0, 2025.0):
+    ...     x, y = (place + motion * (year - 2022)
+    ...             + rng.normal(0, 0.02, (2, 60)))
+    ...     epochs.append(Epoch(Table({
+    ...         'id': np.arange(60), 'x_fit': x, 'y_fit': y,
+    ...         'x_err': np.full(60, 0.02), 'y_err': np.full(60, 0.02)}),
+    ...         time=year))
+    >>> fitter = ProperMotionFitter(references=range(20))
+    >>> solution = fitter.fit(epochs)
+    >>> ax = plotting.plot_motions_by_magnitude(
+    ...     solution.stars, rng.uniform(18, 22, 60), ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('magnitude [mag]', 'motion [pix / yr]')
     """
     ax = current_axes(ax)
     for name, colour in (('pmra', ORANGE), ('pmdec', BLUE)):
@@ -292,6 +405,30 @@ def plot_motion_errors(stars, magnitude, *, bound=None, ax=None):
     `~matplotlib.axes.Axes`
         Its Axes. Reference objects, whose errors a catalogue gave, are left
         out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import Epoch, ProperMotionFitter, plotting
+    >>> rng = np.random.default_rng(1)
+    >>> place, motion = rng.uniform(0, 900, (2, 60)), rng.normal(0, 1, (2, 60))
+    >>> motion[:, :20] = 0  # quasars
+    >>> epochs = []
+    >>> for year in (2020.0, 2022.0, 2025.0):
+    ...     x, y = (place + motion * (year - 2022)
+    ...             + rng.normal(0, 0.02, (2, 60)))
+    ...     epochs.append(Epoch(Table({
+    ...         'id': np.arange(60), 'x_fit': x, 'y_fit': y,
+    ...         'x_err': np.full(60, 0.02), 'y_err': np.full(60, 0.02)}),
+    ...         time=year))
+    >>> fitter = ProperMotionFitter(references=range(20))
+    >>> solution = fitter.fit(epochs)
+    >>> ax = plotting.plot_motion_errors(
+    ...     solution.stars, rng.uniform(18, 22, 60), ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('magnitude [mag]', 'error [pix / yr]')
     """
     ax = current_axes(ax)
     free = ~_is_reference(stars)
@@ -324,6 +461,31 @@ def plot_errors_by_epochs(solutions, *, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import Epoch, ProperMotionFitter, plotting
+    >>> rng = np.random.default_rng(1)
+    >>> place, motion = rng.uniform(0, 900, (2, 60)), rng.normal(0, 1, (2, 60))
+    >>> motion[:, :20] = 0  # quasars
+    >>> epochs = []
+    >>> for year in (2020.0, 2022.0, 2025.0):
+    ...     x, y = (place + motion * (year - 2022)
+    ...             + rng.normal(0, 0.02, (2, 60)))
+    ...     epochs.append(Epoch(Table({
+    ...         'id': np.arange(60), 'x_fit': x, 'y_fit': y,
+    ...         'x_err': np.full(60, 0.02), 'y_err': np.full(60, 0.02)}),
+    ...         time=year))
+    >>> fitter = ProperMotionFitter(references=range(20))
+    >>> solution = fitter.fit(epochs)
+    >>> solutions = [fitter.fit(epochs[:2]), solution]
+    >>> ax = plotting.plot_errors_by_epochs(solutions,
+    ...                                     ax=Figure().add_subplot())
+    >>> ax.get_xlabel()
+    'number of epochs'
     """
     ax = current_axes(ax)
     counts = [len(solution.epochs) for solution in solutions]
@@ -361,6 +523,25 @@ def plot_cutouts(cutouts, *, ax=None):
     ------
     ValueError
         If the table has no rows.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import (
+    ...     ImageEpoch, Instrument, PixelMotionFitter, paper_exposures,
+    ...     plotting, simulate_epochs, sky_field)
+    >>> sources = sky_field(4, 4, size=0.12, magnitudes=(20, 22),
+    ...                     parallaxes=False, separation=1.0, rng=1)
+    >>> images = [ImageEpoch(one.image, one.psf, one.wcs, one.time,
+    ...                      error=one.error)
+    ...           for one in simulate_epochs(
+    ...               sources, paper_exposures()[::3], rng=2,
+    ...               instrument=Instrument(shape=(200, 200)))]
+    >>> solution = PixelMotionFitter().fit(images, sources['ra', 'dec'])
+    >>> ax = plotting.plot_cutouts(solution.cutouts(),
+    ...                            ax=Figure().add_subplot())
+    >>> len(ax.images)
+    1
     """
     if not len(cutouts):
         msg = 'cutouts must have at least one row, got none'
