@@ -94,10 +94,14 @@ class MixturePosterior:
     >>> len(posterior.draws(10))
     10
     >>> table = posterior.summary()
-    >>> for name in ('mean', 'sd', 'r_hat'):
-    ...     table[name].info.format = '.3f'
-    >>> table['parameter', 'mean', 'sd', 'r_hat'][1:4].pprint()
-    !!KeyError: 'sd'
+    >>> for name in ('mean', 'std', 'r_hat'):
+    ...     table[name].info.format = '.2f'
+    >>> table['parameter', 'mean', 'std', 'r_hat'][1:4].pprint()
+    parameter   mean std  r_hat
+    ---------- ----- ---- -----
+      x_mean_1 -0.00 0.01  0.98
+      y_mean_1  0.00 0.01  0.98
+    x_stddev_1  1.41 0.01  0.98
     """
 
     weights: np.ndarray
