@@ -82,6 +82,7 @@ _OWNERS = {
     'Instrument': 'simulation',
     'Optics': 'simulation',
     'paper_exposures': 'simulation',
+    'paper_scene': 'simulation',
     'render_stars': 'simulation',
     'Scene': 'simulation',
     'simulate': 'simulation',
