@@ -30,14 +30,17 @@ __version__: str
 
 class Band:
     name: str
-    wavelengths: tuple[float, float]
+    wavelengths: tuple[float, ...]
     efficiency: float
     sky: float
     diameter: float
+    response: tuple[float, ...]
     def __init__(
         self, name: str, wavelengths: tuple[float, float], efficiency: float,
-        sky: float, diameter: float = 2.0,
+        sky: float, diameter: float = 2.0, *,
+        response: tuple[float, ...] = (1.0, 1.0),
     ) -> None: ...
+    def colours(self, n: int) -> NDArray[Any]: ...
     def magnitude(self, rate: ArrayLike) -> float | NDArray[Any]: ...
     @property
     def pivot(self) -> float: ...
@@ -111,12 +114,19 @@ class DetectorEffects:
     bleeding: bool
     charge_diffusion: float
     brighter_fatter: float
+    large_scale_flat: float
+    flat_error: float
+    shutter: float
+    warm_pixels: float
+    warm_dark: float
     def __init__(
         self, prnu: float = 0.0, hot_pixels: float = 0.0,
         dead_pixels: float = 0.0, hot_dark: float = 5.0, bad_columns: int = 0,
         cosmic_rays: float = 0.0, nonlinearity: float = 0.0,
         bleeding: bool = False, charge_diffusion: float = 0.0,
-        brighter_fatter: float = 0.0,
+        brighter_fatter: float = 0.0, large_scale_flat: float = 0.0,
+        flat_error: float = 0.0, shutter: float = 0.0,
+        warm_pixels: float = 0.0, warm_dark: float = 0.3,
     ) -> None: ...
     @classmethod
     def typical(cls) -> Self: ...
@@ -665,6 +675,9 @@ class Optics:
         pixel_scale: float = 0.074, rng: int | Generator = 24,
     ) -> None: ...
     def aberrations(self, x: float, y: float) -> NDArray[Any]: ...
+    def light(
+        self, x: float, y: float, *, oversampling: int = 4, radius: int = 24,
+    ) -> NDArray[Any]: ...
     def profile(self, x: float, y: float) -> Any: ...
     def to_gridded_psf(
         self, n_nodes: int = 21, *, n_samples: int = 10, oversampling: int = 4,
@@ -936,7 +949,7 @@ def cramer_rao(
 
 def crowded_field(
     shape: int | tuple[int, int], *, density: float = 0.06346810008665511,
-    magnitudes: tuple[float, float] = (16.0, 26.0), margin: float = 24,
+    magnitudes: tuple[float, ...] = (16.0, 26.0), margin: float = 24,
     rng: int | Generator = 0,
 ) -> QTable: ...
 
@@ -1017,6 +1030,14 @@ def paper_exposures(
     aberration: bool = False, rng: int | Generator = 2,
 ) -> list[Exposure]: ...
 
+def paper_scene(
+    field: Literal['ngp', 'ngp-psf', 'bulge'] = 'ngp',
+    shape: int | tuple[int, int] | None = None, *, epoch: int = 3,
+    psf: Union[GriddedMixturePSF, GriddedPSFModel, None] = None,
+    effects: DetectorEffects | None = None, rng: int = 0,
+    executor: Executor | None = None,
+) -> Scene: ...
+
 def pixel_error(
     light: ArrayLike | NDData, *, sky: ArrayLike = 0,
     read_noise: ArrayLike = 0, gain: ArrayLike = 1,
@@ -1089,15 +1110,15 @@ def simulate_epochs(
 def sky_field(
     n_stars: int = 614, n_qsos: int = 590, *, ra: float = 192.8595,
     dec: float = 27.1283, size: float = 11.3, parallaxes: bool = True,
-    separation: float = 0.0, magnitudes: tuple[float, float] | None = None,
+    separation: float = 0.0, magnitudes: tuple[float, ...] | None = None,
     rng: int | Generator = 0,
 ) -> QTable: ...
 
 def sparse_field(
     shape: int | tuple[int, int], *, spacing: int = 46,
     psf_fraction: float = 0.28,
-    psf_magnitudes: tuple[float, float] = (18.0, 20.5),
-    magnitudes: tuple[float, float] = (18.0, 26.0), rng: int | Generator = 0,
+    psf_magnitudes: tuple[float, ...] = (18.0, 20.5),
+    magnitudes: tuple[float, ...] = (18.0, 26.0), rng: int | Generator = 0,
 ) -> QTable: ...
 
 def to_flux_densities(
