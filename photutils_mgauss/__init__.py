@@ -93,7 +93,7 @@ _OWNERS = {
     'sparse_field': 'simulation',
 }
 
-__getattr__, __dir__, _names = hand_on(__name__, _OWNERS)
+__getattr__, __dir__, _names = hand_on(__name__, _OWNERS, ('plotting',))
 __all__ = ['__version__', *_names]
 
 # Table.read(file, format='mgauss.dolphot') and its likes.

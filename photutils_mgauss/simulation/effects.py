@@ -102,8 +102,8 @@ class DetectorEffects:
     >>> from photutils_mgauss.simulation import DetectorEffects
     >>> DetectorEffects(cosmic_rays=1.5, bleeding=True).prnu
     0.0
-    >>> DetectorEffects.typical().bleeding
-    True
+    >>> DetectorEffects.typical().prnu
+    0.01
     """
 
     prnu: float = 0.0

@@ -78,8 +78,8 @@ class Scene:
     >>> from photutils_mgauss import Instrument, simulate, sparse_field
     >>> scene = simulate(sparse_field((150, 200), rng=1), rng=2,
     ...                  instrument=Instrument(shape=(150, 200)))
-    >>> scene.image.shape == scene.error.shape == scene.mask.shape
-    True
+    >>> scene.image.shape, scene.error.shape, scene.mask.shape
+    ((150, 200), (150, 200), (150, 200))
     >>> data = scene.image - scene.background
     >>> stars = scene.truth[scene.truth['inside']]
     >>> stars['x', 'y', 'flux', 'mag'].colnames
