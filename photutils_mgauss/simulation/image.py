@@ -4,7 +4,7 @@ From stars to pixels: light, charge and readout, in bands of rows.
 Each band has random numbers of its own, so that a seed gives the same pixels
 with any number of threads.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -15,6 +15,7 @@ from photutils_mgauss.simulation.effects import (
     DetectorEffects,
     add_cosmic_rays,
     bleed,
+    illumination,
     pattern,
     respond,
 )
@@ -100,8 +101,12 @@ class Chip:
 
     def pattern(self, band):
         """Return what is fixed about a band of rows."""
-        return pattern(self.effects, self.exposure.detector, band,
-                       self.instrument.shape[1])
+        fixed = pattern(self.effects, self.exposure.detector, band,
+                        self.instrument.shape[1])
+        light = illumination(self.effects, self.exposure.detector,
+                             self.instrument, band)
+        return replace(fixed, flat=fixed.flat * light,
+                       response=fixed.response * light)
 
 
 def expose(chip, truth, psf, rng, executor):
