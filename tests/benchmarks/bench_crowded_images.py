@@ -25,7 +25,11 @@ from astropy.nddata import NDData, StdDevUncertainty
 from astropy.wcs import WCS
 from scipy.spatial import cKDTree
 
-from photutils_mgauss import CrowdedMixturePhotometry, ImageEpoch
+from photutils_mgauss import (
+    CrowdedMixturePhotometry,
+    GriddedMixturePSF,
+    ImageEpoch,
+)
 
 SCALE, MARGIN, RIM, RADIUS = 74.0, 20, 3, 0.7
 NOT_STARS = 262144 | 65536
@@ -44,7 +48,7 @@ def make_wcs(size, turn=0.0, x=0.0, y=0.0):
 class Field:
     """Exposures of one field, and the truth in pixels of the first."""
 
-    def __init__(self, args, psf):
+    def __init__(self, args, optics):
         rng = np.random.default_rng(args.seed)
         self.size, n = args.size, args.images
         truth = light.even_stars(self.size + 2 * MARGIN, args.seed)
@@ -66,7 +70,7 @@ class Field:
                 self.frames[0].pixel_to_world(self.x - shift[0],
                                               self.y + shift[1]))
             self.flux.append(np.asarray(one['flux']))
-            drawn = light.draw(psf, one, (self.size, self.size))
+            drawn = optics.draw(one, (self.size, self.size))
             self.scenes.append(light.expose(drawn, one,
                                             1000 * args.seed + k).images)
         self.flux = np.array(self.flux)
@@ -262,10 +266,9 @@ def main():
     if args.quick:
         args.size, args.images = 128, 2
     warnings.simplefilter('ignore')
-    psf = light.make_psf(args.size, args.seed)
-    if args.psf:
-        psf = type(psf).read(args.psf)
-    field = Field(args, psf)
+    optics = (light.Optics(GriddedMixturePSF.read(args.psf)) if args.psf
+              else light.Optics.of(args.size, args.seed))
+    psf, field = optics.psf, Field(args, optics)
     with ThreadPoolExecutor(1) as pool:
         alone, single = each_alone(field, psf, pool)
         joint, seconds = together(field, psf, args.motions, pool)
