@@ -10,6 +10,7 @@ from photutils_mgauss.cli import chips, photometry, pixel_motions, tools
 from photutils_mgauss.cli import psf as psf_command
 from photutils_mgauss.cli.observers import check_observer, observer_at
 from photutils_mgauss.cli.progress import Progress
+from photutils_mgauss.cli.psf_stars import check_image
 from photutils_mgauss.cli.results import (
     Results,
     add_checkpoint,
@@ -238,7 +239,7 @@ def _where(chosen, names):
 
 def _check_image(options, image):
     """Raise if an image cannot become an epoch."""
-    psf_command.check_image(image)
+    check_image(image)
     if image.wcs is None and not options.plane:
         raise ValueError(_no_sky(image.path))
     if image.time is None:

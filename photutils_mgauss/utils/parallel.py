@@ -17,12 +17,22 @@ from threading import Thread, current_thread, main_thread
 _WATCHER = ContextVar('watcher', default=None)
 
 
+# The cores of which this process takes no more, by order of who started it.
+_LIMIT = {}
+
+
 def available_cores():
     """Return the number of cores this process may use."""
     try:
-        return len(os.sched_getaffinity(0))
+        cores = len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux
-        return os.cpu_count() or 1
+        cores = os.cpu_count() or 1
+    return min(cores, _LIMIT.get('cores', cores))
+
+
+def limit_cores(number):
+    """Have this process use no more cores, because others work beside it."""
+    _LIMIT['cores'] = number
 
 
 class Threads(Executor):
