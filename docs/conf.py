@@ -26,12 +26,22 @@ version = '.'.join(release.split('.')[:2])
 
 sys.path.insert(0, str(Path(__file__).parent))
 extensions.remove('sphinx.ext.todo')
-extensions += ['make_gallery', 'make_house']
+extensions.remove('sphinx.ext.mathjax')
+extensions += ['make_formulae', 'make_gallery', 'make_house']
+html_math_renderer = 'mathml'
 exclude_patterns = ['_build', '**.ipynb_checkpoints']
 html_title = f'{project} {release}'
 html_static_path = ['_static']
 html_css_files = ['mgauss.css']
-html_theme_options = {}
+html_logo = ''
+# The theme is Astropy's; the bar above, its links and its statistics are not.
+html_theme_options = {
+    'sst_project_name': project, 'sst_site_root': '.', 'sst_is_root': True,
+    'navbar_links': [['Quickstart', 'quickstart'],
+                     ['What do you want to do?', 'tasks/index'],
+                     ['API', 'api'], ['Get help', 'help'],
+                     ['Cite', 'cite'], ['Contribute', 'contributing']],
+    'footer_links': [], 'goatcounter_analytics_url': False}
 modindex_common_prefix = ['photutils_mgauss.']
 
 # Every name of ours must resolve, and is looked for in the package first.

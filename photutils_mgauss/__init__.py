@@ -82,6 +82,7 @@ _OWNERS = {
     'Instrument': 'simulation',
     'Optics': 'simulation',
     'paper_exposures': 'simulation',
+    'paper_scene': 'simulation',
     'render_stars': 'simulation',
     'Scene': 'simulation',
     'simulate': 'simulation',
@@ -92,7 +93,7 @@ _OWNERS = {
     'sparse_field': 'simulation',
 }
 
-__getattr__, __dir__, _names = hand_on(__name__, _OWNERS)
+__getattr__, __dir__, _names = hand_on(__name__, _OWNERS, ('plotting',))
 __all__ = ['__version__', *_names]
 
 # Table.read(file, format='mgauss.dolphot') and its likes.

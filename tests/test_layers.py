@@ -236,6 +236,11 @@ def test_every_public_name_can_be_reached_and_is_listed():
         assert name in dir(photutils_mgauss)
 
 
+def test_figures_are_there_without_an_import_of_their_own():
+    assert 'plot_corner' in run(
+        'import photutils_mgauss as mgauss; print(dir(mgauss.plotting))')
+
+
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match='nothing_here'):
         photutils_mgauss.nothing_here  # noqa: B018

@@ -50,6 +50,9 @@ def main(argv=None):
     """
     parser = make_parser()
     words = sys.argv[1:] if argv is None else list(argv)
+    if not words:
+        parser.print_help(sys.stderr)
+        return 2
     options, unknown = parser.parse_known_args(words)
     if unknown:
         options.parser.error(_unknown(options.parser, unknown))

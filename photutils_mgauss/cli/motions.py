@@ -1,13 +1,16 @@
 """``mgauss motions``: catalogues or images to motions and corrected WCS."""
 import json
 import warnings
+from argparse import ArgumentTypeError
 from functools import cache, partial
+from operator import attrgetter
 from pathlib import Path
 
-from photutils_mgauss.cli import photometry, pixel_motions, tools
+from photutils_mgauss.cli import chips, photometry, pixel_motions, tools
 from photutils_mgauss.cli import psf as psf_command
 from photutils_mgauss.cli.observers import check_observer, observer_at
 from photutils_mgauss.cli.progress import Progress
+from photutils_mgauss.cli.psf_stars import check_image
 from photutils_mgauss.cli.results import (
     Results,
     add_checkpoint,
@@ -43,6 +46,7 @@ def add(commands):
     parser.add_argument('--format', choices=('ecsv', 'fits'), default='ecsv',
                         help='of the tables (default: %(default)s)')
     _add_solution(parser)
+    chips.add_options(parser)
     pixel_motions.add_options(parser)
     tools.add_times(parser)
     psf_command.add_fit(parser)
@@ -63,7 +67,7 @@ def _add_solution(parser):
                        choices=('qso', 'galaxy', 'star', 'position'),
                        help='class of all references, for tables without '
                             'that column')
-    group.add_argument('--transform', metavar='KIND',
+    group.add_argument('--transform', metavar='KIND', type=tools.transform,
                        help='what may differ between exposures: none, '
                             'shift, rigid, similarity, affine, poly-2, ... '
                             '(default: %(default)s, or none with '
@@ -77,9 +81,16 @@ def _add_solution(parser):
                             'table, with id, ra, dec, pmra, pmdec, ref_epoch '
                             '(and errors), and a rough parallax, by which '
                             'they are found')
-    group.add_argument('--systematic', type=tools.positive, metavar='MAS',
+    group.add_argument('--systematic', type=_systematic, metavar='MAS',
                        help='error of each exposure to be added to those of '
-                            'its stars (default: fitted)')
+                            'its stars (default: fitted); magnitude also '
+                            'fits how wrong the errors of stars are, as a '
+                            'function of magnitude')
+    group.add_argument('--terms', nargs='+', default=[],
+                       choices=('magnitude', 'colour', 'y'),
+                       help='what stars of an exposure may be displaced by, '
+                            'besides their place; used where it predicts '
+                            'stars that were left out')
     group.add_argument('--observer', metavar='NAME',
                        help='from where parallaxes are seen: earth, leo, l2, '
                             'or a table of barycentric places x, y, z [au], '
@@ -102,6 +113,15 @@ def _add_solution(parser):
                        help='take pixels for coordinates, without WCS')
 
 
+def _systematic(text):
+    """Return a positive number or 'magnitude', for argparse."""
+    try:
+        return text if text == 'magnitude' else tools.positive(text)
+    except ArgumentTypeError as error:
+        msg = f'must be a positive number or magnitude, got {text}'
+        raise ArgumentTypeError(msg) from error
+
+
 def run(options):
     """Measure the motions."""
     if options.pixels:
@@ -110,28 +130,36 @@ def run(options):
     paths = options.inputs
     _check(options)
     folder = Path(options.output)
-    are_tables = [is_table(path) for path in paths]
-    names = _Names(folder, paths, are_tables, options.format)
-    read = tools.read_images(options, paths)
+    pieces = chips.pieces_of(options, [is_table(path) for path in paths])
+    names = _Names(folder, pieces, options)
+    images = tools.read_images(options, paths)
+
+    def read(k):
+        return images(pieces[k].given, pieces[k].ext)
+
     fitter = _fitter(options)
     results = Results(options)
     results.claim(names.all(), paths)
-    with Progress(1 + len(paths) + 2, options) as step:
+    with Progress(1 + len(pieces) + 2, options) as step:
         step('look at all files')
-        epochs = [_from_catalogue(options, i) if are_tables[i]
-                  else _check_image(options, read(i))
-                  for i in range(len(paths))]
-        if results.only_planned():
+        seen = [_from_catalogue(options, piece) if piece.is_table
+                else _check_image(options, read(k))
+                for k, piece in enumerate(pieces)]
+        if results.only_planned(names.without_wcs()):
             return
-        for i, path in enumerate(paths):
-            step(f'measure {path}' if epochs[i] is None else f'use {path}')
-            if epochs[i] is None:
-                epochs[i] = _from_image(options, read(i), names, i, results)
-            tools.say(options, f'{path}: {epochs[i]!r}')
+        for k, piece in enumerate(pieces):
+            step(f'{"use" if piece.is_table else "measure"} {piece.name}')
+            if not piece.is_table:
+                seen[k] = _from_image(options, read(k), names, k, results)
+        exposures = chips.exposures_of(pieces, seen, options.chips)
+        epochs = [_epoch(options, pieces, seen, own) for own in exposures]
         step('align and fit')
         solution = fitter.fit(epochs)
         step(f'write to {folder}')
-        _collect(solution, names, options, results)
+        record = tools.record_of(
+            options, notes=list(solution.notes),
+            exposures=[Path(seen[own[0]].image).name for own in exposures])
+        _collect(solution, names, exposures, record, results)
         # Nothing is written before all is well.
         results.deliver()
     tools.say(options, *_summary(solution), f'files are in {folder}')
@@ -140,6 +168,7 @@ def run(options):
 def _check(options):
     """Raise for what is wrong before anything is read."""
     pixel_motions.check_alone(options)
+    chips.check(options)
     tools.check_inputs([*options.inputs, options.references, options.stars,
                         options.parallax_of])
     if options.parallax_of and (options.references or options.plane):
@@ -164,8 +193,11 @@ def is_table(path):
     if Path(path).suffix.lower() in _TABLE_SUFFIXES:
         return True
     from photutils_mgauss.files.image_layers import is_asdf, open_fits
+    from photutils_mgauss.files.tables import is_fits
     if is_asdf(path):
         return False
+    if not is_fits(path) and '.fit' not in Path(path).name.lower():
+        return True
     with tools.about(path), open_fits(path) as hdus:
         images = [hdu for hdu in hdus if hdu.is_image
                   and hdu.header.get('NAXIS', 0) >= 2]
@@ -175,22 +207,29 @@ def is_table(path):
 class _Names:
     """The names of all files of a run."""
 
-    def __init__(self, folder, paths, are_tables, form):
+    def __init__(self, folder, pieces, options):
         def named(ending, suffix):
-            return tools.output_names(paths, str(folder), ending, (), suffix)
-        self.tables = {name: folder / f'{name}.{form}' for name in
-                       ('motions', 'alignment', 'residuals')}
-        images = [not table for table in are_tables]
+            return tools.output_names([piece.name for piece in pieces],
+                                      str(folder), ending, (), suffix)
+        tables = ['motions', 'alignment', 'residuals']
+        tables += ['terms'] if options.terms else []
+        self.tables = {name: folder / f'{name}.{options.format}'
+                       for name in tables}
+        images = [not piece.is_table for piece in pieces]
         self.psfs = _where(images, named('_psf', '.fits'))
-        self.catalogues = _where(images, named('_cat', f'.{form}'))
+        self.catalogues = _where(images, named('_cat', f'.{options.format}'))
         self.wcs = [name.with_suffix('') for name in named('_wcs', '.fits')]
+
+    def without_wcs(self):
+        """Return the names of what is always written."""
+        return [*self.tables.values(), *filter(None, self.psfs),
+                *filter(None, self.catalogues)]
 
     def all(self):
         """Return every name that may be written to."""
-        wcs = [name.with_suffix(suffix) for name in self.wcs
-               for suffix in ('.fits', '.asdf')]
-        return [*self.tables.values(), *filter(None, self.psfs),
-                *filter(None, self.catalogues), *wcs]
+        return self.without_wcs() + [
+            name.with_suffix(suffix) for name in self.wcs
+            for suffix in ('.fits', '.asdf')]
 
 
 def _where(chosen, names):
@@ -200,23 +239,24 @@ def _where(chosen, names):
 
 def _check_image(options, image):
     """Raise if an image cannot become an epoch."""
-    psf_command.check_image(image)
+    check_image(image)
     if image.wcs is None and not options.plane:
         raise ValueError(_no_sky(image.path))
     if image.time is None:
         raise ValueError(_no_time(image.path))
 
 
-def _from_image(options, image, names, i, results):
-    """Return the epoch of an image."""
+def _from_image(options, image, names, k, results):
+    """Return what is seen in an image."""
     key = results.key(file_marks(image.path, image.reading.wcs,
                                  options.stars), image.content)
-    psf = results.obtain(names.psfs[i], key, partial(
+    psf = results.obtain(names.psfs[k], key, partial(
         psf_command.make, options, image), psf_command.read)
-    name = names.catalogues[i]
+    name = names.catalogues[k]
     table = results.obtain(name, f'{key}_cat', partial(
         photometry.make, options, image, psf, name), _read_table)
-    return _epoch(options, image.path, table, image.wcs, image.time)
+    return _seen(options, str(image.path), table, image.wcs, image.time,
+                 image=(str(image.path), image.reading.ext))
 
 
 def _read_table(path):
@@ -224,13 +264,13 @@ def _read_table(path):
     return read_table(path)[0]
 
 
-def _from_catalogue(options, i):
-    path = options.inputs[i]
-    with tools.about(path):
-        return _epoch_of_catalogue(options, path, i)
+def _from_catalogue(options, piece):
+    """Return what is seen in a catalogue."""
+    with tools.about(piece.path):
+        return _seen_in_catalogue(options, piece.path, piece.given)
 
 
-def _epoch_of_catalogue(options, path, i):
+def _seen_in_catalogue(options, path, i):
     from photutils_mgauss.files.tables import read_table
     table, record = read_table(path)
     exposure = record.get('exposure', {})
@@ -238,7 +278,9 @@ def _epoch_of_catalogue(options, path, i):
                                            'time')[i])
     if time is None:
         time = exposure.get('time')
-    return _epoch(options, path, table, _wcs_of(options, i, record), time)
+    image = (chips.image_of(path, record) if options.chips else (path, None))
+    return _seen(options, path, table, _wcs_of(options, i, record), time,
+                 image=image)
 
 
 def _wcs_of(options, i, record):
@@ -262,8 +304,8 @@ def _wcs_of(options, i, record):
     return read_image(file, Reading(ext=exposure.get('ext'))).wcs
 
 
-def _epoch(options, path, table, wcs, time):
-    """Return the `Epoch` of a table, its flagged rows left out."""
+def _seen(options, path, table, wcs, time, *, image):
+    """Return what was seen, its flagged rows left out."""
     from photutils_mgauss.motions import Epoch
     if time is None and 'time' not in table.colnames:
         raise ValueError(_no_time(path))
@@ -276,7 +318,23 @@ def _epoch(options, path, table, wcs, time):
                                table['time'] if time is None else time)
         if options.parallax_of:
             table = _only_targets(options, path, table, time, observer)
-        return Epoch(table, wcs, time, observer=observer)
+        # What is wrong with a catalogue is found before images are measured.
+        Epoch(table, wcs, time, observer=observer)
+    return chips.Seen(table, wcs, time, observer, *image)
+
+
+def _epoch(options, pieces, seen, own):
+    """Return the `Epoch` of an exposure, of its pieces with these numbers."""
+    from photutils_mgauss.motions import Epoch
+    paths, parts = [pieces[k].path for k in own], [seen[k] for k in own]
+    if len(own) > 1 or (options.chips and parts[0].ext is not None):
+        epoch = chips.epoch_of(paths, parts)
+    else:
+        one = parts[0]
+        with tools.about(paths[0]):
+            epoch = Epoch(one.table, one.wcs, one.time, observer=one.observer)
+    tools.say(options, f'{paths[0]}: {epoch!r}')
+    return epoch
 
 
 @cache
@@ -346,9 +404,17 @@ def _fitter(options):
         recipe=options.recipe, parallax=alone or options.parallax,
         references=_references(options),
         match_by='id' if alone else options.match_by,
-        systematic='fit' if systematic is None else systematic * u.mas,
+        systematic=(systematic * u.mas if isinstance(systematic, float)
+                    else systematic or 'fit'),
+        terms=tuple(options.terms), **_distortion(options),
         max_motion=options.max_motion * u.mas / u.yr,
         match_radius=None if radius is None else radius * u.mas)
+
+
+def _distortion(options):
+    kind = options.distortion
+    return {} if kind is None else {
+        'distortion': None if kind == 'none' else kind}
 
 
 def _references(options):
@@ -374,20 +440,48 @@ def _references(options):
     return table
 
 
-def _collect(solution, names, options, results):
+def _collect(solution, names, exposures, record, results):
     """Obtain the tables and the WCS."""
     key = results.key(_content(solution))
     for name, path in names.tables.items():
-        table = getattr(solution, 'stars' if name == 'motions' else name)
-        write = partial(tools.write_table, table, record=tools.record_of(
-            options, notes=list(solution.notes)))
+        table = _TABLES[name](solution)
+        write = partial(tools.write_table, table, record=record)
         results.obtain(path, f'{key}_{name}', partial(_made, table, write))
-    for i, (epoch, name) in enumerate(zip(solution.epochs, names.wcs,
-                                          strict=True)):
-        if epoch.wcs is not None:
-            suffix, write = wcs_writer(epoch, tools.record_of(options))
-            results.obtain(name.with_suffix(suffix), f'{key}_wcs{i}',
-                           partial(_made, epoch.wcs, write))
+    for epoch, own in zip(solution.epochs, exposures, strict=True):
+        for k, wcs in zip(own, _all_wcs(epoch), strict=True):
+            if wcs is not None:
+                suffix, write = wcs_writer(wcs, epoch.mean_year, record)
+                results.obtain(names.wcs[k].with_suffix(suffix),
+                               f'{key}_wcs{k}', partial(_made, wcs, write))
+
+
+def _stars(solution):
+    """Return the stars, and what references measured against catalogue."""
+    import numpy as np
+    stars, away = solution.stars.copy(), solution.reference_differences()
+    order = np.argsort(np.asarray(stars['id']))
+    rows = order[np.searchsorted(np.asarray(stars['id'])[order],
+                                 np.asarray(away['id']))]
+    for name in away.colnames[1:-1] if len(away) else ():
+        values = np.full(len(stars), np.nan)
+        values[rows] = away[name].value
+        stars[name] = values * away[name].unit
+    return stars
+
+
+def _residuals(solution):
+    """Return the residuals, also in the pixels of the detectors."""
+    from astropy.table import hstack
+    return hstack([solution.residuals, solution.detector_residuals()])
+
+
+_TABLES = {'motions': _stars, 'residuals': _residuals,
+           'alignment': attrgetter('alignment'), 'terms': attrgetter('terms')}
+
+
+def _all_wcs(epoch):
+    """Return the WCS of an epoch, or those of its chips."""
+    return [epoch.wcs] if epoch.chips is None else list(epoch.chips.values())
 
 
 def _made(result, write):
@@ -402,22 +496,22 @@ def _content(solution):
                  solution.stars, solution.alignment, solution.residuals)]
 
 
-def wcs_writer(epoch, record):
+def wcs_writer(wcs, year, record):
     """
     Return the suffix of a WCS, and what writes it.
 
     A gwcs is written as ASDF, any other as a FITS header.
     """
     from gwcs import WCS as GWCS
-    if isinstance(epoch.wcs, GWCS):
+    if isinstance(wcs, GWCS):
         import asdf
-        return '.asdf', asdf.AsdfFile({'wcs': epoch.wcs,
+        return '.asdf', asdf.AsdfFile({'wcs': wcs,
                                        'mgauss': record}).write_to
     from astropy.io import fits
 
     from photutils_mgauss.sky.observers import tdb
-    header = epoch.wcs.to_header(relax=True)
-    header['MJD-AVG'] = tdb(epoch.mean_year).mjd, 'middle of the exposure'
+    header = wcs.to_header(relax=True)
+    header['MJD-AVG'] = tdb(year).mjd, 'middle of the exposure'
     header['TIMESYS'] = 'TDB'
     header['MGRUN'] = json.dumps(record)
     return '.fits', fits.PrimaryHDU(header=header).writeto

@@ -4,9 +4,9 @@ import warnings
 from functools import cache, partial
 from pathlib import Path
 
-from photutils_mgauss.cli import psf as psf_command
 from photutils_mgauss.cli import together, tools
 from photutils_mgauss.cli.progress import Progress
+from photutils_mgauss.cli.psf_stars import check_image
 from photutils_mgauss.cli.results import (
     Results,
     add_checkpoint,
@@ -91,7 +91,7 @@ def run(options):
         psfs = {path: _read_psf(path, options.checkpoint)
                 for path in dict.fromkeys(options.psf)}
         for i in range(len(paths)):
-            psf_command.check_image(read(i))
+            check_image(read(i))
         if results.only_planned():
             return
         for i, name in enumerate(names):

@@ -105,7 +105,8 @@ def _check(options):
 
 def _frame(options, i):
     """Return the file with the corrected WCS of an image, or None."""
-    if options.frames is None:
+    # A WCS that is given is what the image is read with.
+    if options.frames is None or options.wcs:
         return None
     name = tools.output_names(options.inputs, options.frames, '_wcs', (),
                               '.fits')[i]

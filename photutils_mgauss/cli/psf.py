@@ -1,8 +1,14 @@
 """``mgauss psf``: images or PSF files to grids of mixtures."""
 from functools import partial
 
-from photutils_mgauss.cli import tools
+from photutils_mgauss.cli import psf_together, tools
 from photutils_mgauss.cli.progress import Progress
+from photutils_mgauss.cli.psf_stars import (
+    check_image,
+    choose,
+    fit_options,
+    no_stars,
+)
 from photutils_mgauss.cli.results import (
     Results,
     add_checkpoint,
@@ -11,8 +17,6 @@ from photutils_mgauss.cli.results import (
 )
 
 _SUFFIXES = ('.fits', '.asdf')
-
-_RADIUS = 10.0
 
 
 def add(commands):
@@ -31,7 +35,7 @@ def add(commands):
     parser.add_argument('--grid-shape', nargs=2, type=tools.count,
                         default=[30, 30], metavar=('NY', 'NX'),
                         help='number of nodes (default: 30 30)')
-    add_fit(parser)
+    psf_together.add_option(add_fit(parser))
     _add_files(parser)
     tools.add_reading(parser)
     add_checkpoint(parser)
@@ -40,7 +44,7 @@ def add(commands):
 
 
 def add_fit(parser):
-    """Add the options of the fit to an image's own stars."""
+    """Add the options of the fit to an image's own stars; return them."""
     group = parser.add_argument_group('the fit')
     group.add_argument('--n-components', type=tools.number_or_auto,
                        metavar='K', help='number of Gaussians, or auto, '
@@ -60,6 +64,7 @@ def add_fit(parser):
     group.add_argument('--stars', metavar='TABLE',
                        help='table with x, y of the stars to look at, '
                             'instead of detection')
+    return group
 
 
 def _add_files(parser):
@@ -76,6 +81,9 @@ def run(options):
     paths = options.inputs
     tools.check_inputs([*paths, options.stars])
     tools.check_different(paths)
+    if options.together:
+        psf_together.run(options)
+        return
     names = tools.output_names(paths, options.output, '_psf', _SUFFIXES,
                                '.fits')
     read = tools.read_images(options, paths)
@@ -112,12 +120,6 @@ def _kind(options, path, read):
         return 'epsf'
     check_image(read())
     return kind
-
-
-def check_image(image):
-    """Raise if an image cannot be measured, and before any is."""
-    with tools.about(image.path):
-        image.check()
 
 
 def _make(options, path, image, kind):
@@ -172,11 +174,10 @@ def from_stars(image, options):
 
 def _from_stars(image, options):
     from photutils_mgauss.field.fit import fit_mixture_field
-    given = {name: getattr(options, name)
-             for name in ('n_components', 'degree', 'radius')}
-    fit = {'radius': _RADIUS}
-    fit |= {name: value for name, value in given.items() if value is not None}
-    stars = _choose(image, fit['radius'], options)
+    fit = fit_options(options)
+    stars = choose(image, fit['radius'], options)
+    if not stars['selected'].any():
+        raise ValueError(no_stars(image, stars))
     field = fit_mixture_field(
         image.without_sky, stars, error=image.noise.total, mask=image.mask,
         effective_gain=image.noise.gain, **fit)
@@ -188,34 +189,6 @@ def _from_stars(image, options):
              'stars': [[round(float(x), 2), round(float(y), 2)]
                        for x, y in zip(used['x'], used['y'], strict=True)]}
     return field.to_grid(tuple(options.grid_shape)), found
-
-
-def _choose(image, radius, options):
-    from photutils_mgauss.field.selection import select_psf_stars
-    from photutils_mgauss.files.tables import read_table
-    sources = None
-    if options.stars is not None:
-        sources, _ = read_table(options.stars)
-    saturation = image.saturation
-    if saturation is not None:
-        # The level is that of the image with its sky.
-        saturation -= float(image.sky.background_median)
-    stars = select_psf_stars(
-        image.without_sky, sources, error=image.noise.total, mask=image.mask,
-        radius=radius, saturation=saturation, min_snr=options.min_snr,
-        max_stars=options.max_stars)
-    if not stars['selected'].any():
-        raise ValueError(_no_stars(image, stars))
-    return stars
-
-
-def _no_stars(image, stars):
-    """Return why no star was good enough."""
-    reasons = [str(reason) for reason in stars['reason']]
-    counts = ', '.join(f'{reasons.count(reason)} {reason}'
-                       for reason in sorted(set(reasons)))
-    return (f'{image.path}: must have at least 1 star good for the PSF, got '
-            f'none of {len(stars)}: {counts}; try --min-snr or --radius')
 
 
 def _describe(psf, found):

@@ -54,11 +54,15 @@ class Results:
         if self.folder:
             tools.check_folder(self.folder)
 
-    def only_planned(self):
-        """Say what would be written and return True in a dry run."""
+    def only_planned(self, names=None):
+        """
+        Say what would be written and return True in a dry run.
+
+        ``names`` are those of the files, if fewer than were claimed.
+        """
         if self._options.dry_run:
-            tools.say(self._options, *(f'would write {name}'
-                                       for name in self._claimed))
+            tools.say(self._options, *(
+                f'would write {name}' for name in names or self._claimed))
         return self._options.dry_run
 
     def _is_ours(self, name):

@@ -18,6 +18,10 @@ _SHOWN = 12
 _TICKS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 1000)
 # A median of reduced chi2 or uwe in this range says that errors are right.
 _RIGHT = (0.8, 1.25)
+# More detections than this share are not rejected if all is well.
+_MANY = 0.1
+# Detections on a chip that a map of residuals takes.
+_FOR_A_MAP = 200
 
 
 def psf_section(path):
@@ -180,6 +184,7 @@ def motion_section(path, table, record):
     free = np.asarray(table['reference']) == ''
     facts['References'] = int(np.sum(~free))
     facts |= _gain(record.get('catalogues', {}), unit)
+    facts |= _reference_facts(table)
     for name in ('pmra', 'pmdec'):
         values = column_values(table, f'{name}_error')[solved]
         if values.size:
@@ -208,6 +213,19 @@ def _motion_verdict(table, solved, free):
         f'{words}; residuals are {middle:.2f} times the stated errors')
 
 
+def _reference_facts(table):
+    """Return how references compare with their catalogue."""
+    if 'dpmra' not in table.colnames:
+        return {}
+    pulls = np.concatenate([column_values(table, name)
+                            / column_values(table, f'{name}_error')
+                            for name in ('dpmra', 'dpmdec')])
+    pulls = pulls[np.isfinite(pulls)]
+    return {} if not pulls.size else {
+        'References, measured minus catalogue, in their errors':
+            f'{np.sqrt(np.mean(pulls**2)):.2f}'}
+
+
 def _gain(catalogues, unit):
     """Return facts on what catalogues gave of the same exposures."""
     facts = {}
@@ -224,6 +242,11 @@ def _gain(catalogues, unit):
 def _motion_panels(table, solved, free):
     panels = [Panel(lambda ax: plotting.plot_proper_motions(
         table[solved], ax=ax), 'The proper motions.')]
+    if 'dpmra' in table.colnames:
+        panels.append(Panel(
+            lambda ax: plotting.plot_reference_differences(table, ax=ax),
+            'The motions of references as the exposures alone have them, '
+            'minus those of their catalogue.'))
     # The motions of references are what a catalogue says.
     stars = table[solved & free]
     with np.errstate(invalid='ignore', divide='ignore'):
@@ -281,7 +304,8 @@ def alignment_section(path, table, record):
 
 def _names_of_epochs(record):
     """Return the names of the files that epochs were made of, by number."""
-    inputs = record.get('options', {}).get('inputs', [])
+    inputs = record.get('exposures',
+                        record.get('options', {}).get('inputs', []))
     return {i: Path(name).name for i, name in enumerate(inputs)}
 
 
@@ -290,7 +314,8 @@ def _alignment_verdict(table, names):
     if not {'n_references', 'n_rejected'} <= set(table.colnames):
         return None
     used = column_values(table, 'n_references')
-    share = column_values(table, 'n_rejected') / np.maximum(used, 1)
+    rejected = column_values(table, 'n_rejected')
+    share = rejected / np.maximum(used + rejected, 1)
     worst = int(np.argmax(share))
     name = names.get(worst, f'epoch {worst}')
     return Verdict(bool(used.min() >= 5 and share[worst] < 0.25),
@@ -310,16 +335,46 @@ def residual_section(path, table, record):
     shown, names = SimpleNamespace(residuals=rows), _names_of_epochs(record)
     epochs, counts = np.unique(np.asarray(rows['epoch']), return_counts=True)
     panels = [Panel(lambda ax, epoch=epoch: plotting.plot_residual_vectors(
-        shown, epoch, ax=ax),
+        shown, epoch, title=names.get(epoch), ax=ax),
         f'Residuals of {names.get(epoch, f"epoch {epoch}")}.')
         for epoch in epochs[counts > 1].tolist()]
+    panels += _detector_panels(rows)
     return Section(
         f'Residuals: {path}', panels=tuple(panels), record=record,
+        verdict=_residual_verdict(table, rows),
         facts={'Detections': len(table),
                'Detections of stars with three or more': len(rows)},
         text='Each arrow is a detection minus the fitted motion of its star; '
              'rejected detections are orange. A star with two detections '
              'has no residuals, because a line passes through both.')
+
+
+def _residual_verdict(table, rows):
+    """Judge residuals by the share of detections that were rejected."""
+    if not len(rows):
+        return Verdict(True, f'{len(table)} detections; none has a residual, '
+                       'as no star has three')
+    share = float(np.mean(~np.asarray(rows['used'], bool)))
+    return Verdict(share < _MANY, f'{share:.1%} of {len(rows)} detections '
+                   'were rejected')
+
+
+def _detector_panels(rows):
+    """Return maps of the residuals of each chip, where there are enough."""
+    if 'dx_pix' not in rows.colnames:
+        return []
+    known = rows[np.isfinite(column_values(rows, 'dx_pix'))]
+    chips, counts = np.unique(np.ma.filled(known['chip'], ''),
+                              return_counts=True)
+    return [Panel(lambda ax, chip=chip: plotting.plot_residual_map(
+        known, chip, ax=ax),
+        f'Mean residuals of all exposures over {_chip(chip)}, in pixels; '
+        'grey where they are not significant.')
+        for chip in chips[counts >= _FOR_A_MAP].tolist()]
+
+
+def _chip(name):
+    return f'chip {name}' if name else 'the detector'
 
 
 def _judged(table):

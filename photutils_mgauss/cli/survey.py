@@ -8,8 +8,6 @@ from tqdm import tqdm
 
 from photutils_mgauss.cli import tools
 
-# Results of a task that is done again are replaced.
-_TO = ('--overwrite', '--output')
 _EXAMPLE = """\
 # What mgauss survey does. Names are relative to the folder of this file.
 output = "survey"
@@ -17,8 +15,10 @@ output = "survey"
 [exposures]
 files = {files}
 # ext = "SCI"             # of files with several images: all of this name
+# detector = "DETECTOR"   # keyword that tells detectors apart
 # group_by = ["FILTER"]   # keywords whose values keep fields apart
 # overlap = 0.5           # share in common from which images are of one field
+# gain = 1.5              # and other options of how images are read
 
 # The options of mgauss psf, photometry and motions, with _ for -.
 [psf]
@@ -26,13 +26,18 @@ files = {files}
 # degree = 3
 
 [photometry]
+# psf = "detector"        # one fit for all exposures of a detector, or
 # psf = "psf.fits"        # measure with this PSF, and make none
 # crowded = true
 
 [motions]
 # references = "gaia.ecsv"
 # parallax = true
+# pixels = true           # then, from the pixels of all images of a field
+# together = true         # one solution for all fields that touch
 """
+# So many exposures of a field are named in the plan.
+_NAMED = 6
 
 
 def add(commands):
@@ -68,9 +73,11 @@ def run(options):
     from photutils_mgauss.cli.survey_plan import read_survey
     path = Path(options.file)
     tools.check_inputs([path])
+    from photutils_mgauss.cli.survey_folder import check_output
     survey = read_survey(path)
-    tools.check_folder(survey.output)
-    tools.say(options, *_plan(survey))
+    kept = _kept(survey)
+    check_output(survey, len(survey.exposures) - len(kept))
+    tools.say(options, *_plan(survey, kept))
     if not options.dry_run:
         _run(options, survey)
 
@@ -95,153 +102,139 @@ def _write_example(options):
     tools.say(options, f'{name} is written, for {len(images)} images')
 
 
-def _plan(survey):
-    """Return the lines that show what will be done."""
-    tasks = exposure_tasks(survey)
+def _kept(survey):
+    """Return the outcomes of exposures that an earlier run has done."""
     from photutils_mgauss.cli.survey_run import kept_outcome
-    old = sum(kept_outcome(task) is not None for task in tasks)
+    from photutils_mgauss.cli.survey_tasks import exposure_tasks
+    found = map(kept_outcome, exposure_tasks(survey))
+    return [outcome for outcome in found if outcome is not None]
+
+
+def _plan(survey, kept):
+    """Return the lines that show what will be done."""
     total = (f'{len(survey.exposures)} exposures in {len(survey.fields)} '
              f'fields, to {survey.output}')
-    lines = [total, f'{old} exposures have results of an earlier run']
+    lines = [total, f'{len(kept)} exposures have results of an earlier run',
+             _cost(survey, kept)]
     for name, members in survey.fields.items():
         years = [survey.exposures[i].year for i in members]
-        names = ', '.join(survey.exposures[i].name for i in members)
+        names = [survey.exposures[i].name for i in members]
+        more = ', ...' if len(names) > _NAMED else ''
         lines.append(f'  {name}: {len(members)} exposures, {min(years):.2f} '
-                     f'to {max(years):.2f}: {names}')
+                     f'to {max(years):.2f}: {", ".join(names[:_NAMED])}'
+                     f'{more}')
     return lines
 
 
-def exposure_tasks(survey):
-    """Return the task of each exposure: its PSF and its catalogue."""
-    return [_exposure_task(survey, exposure) for exposure in survey.exposures]
-
-
-def _exposure_task(survey, exposure):
-    from photutils_mgauss.cli.survey_run import Task
-    catalogue, psf = _catalogue(survey, exposure), _psf(survey, exposure)
-    ext = () if exposure.ext is None else ('--ext', exposure.ext)
-    image = str(exposure.path)
-    commands, given = [], []
-    photometry = survey.options['photometry']
-    if psf is not None:
-        commands.append(('psf', image, *_TO, str(psf), *ext,
-                         *survey.options['psf']))
-        given = ['--psf', str(psf)]
-    commands.append(('photometry', image, *_TO, str(catalogue), *given,
-                     *ext, *photometry))
-    outputs = [str(path) for path in (psf, catalogue) if path is not None]
-    return Task(exposure.name, tuple(commands), (image,), tuple(outputs),
-                str(survey.output / 'records' / f'{exposure.name}.json'))
-
-
-def _psf(survey, exposure):
-    """Return the file of an exposure's own PSF, or None if it has none."""
-    words = survey.options['photometry']
-    if '--psf' in words or '--crowded' in words:
-        return None
-    return survey.output / 'psfs' / f'{exposure.name}.fits'
-
-
-def _catalogue(survey, exposure):
-    return survey.output / 'catalogues' / f'{exposure.name}.ecsv'
-
-
-def field_tasks(survey, measured):
-    """
-    Return the task of each field that has something to fit.
-
-    Parameters
-    ----------
-    survey : Survey
-        The plan.
-    measured : set of str
-        The exposures that have a catalogue.
-
-    Returns
-    -------
-    list of Task
-    """
-    from photutils_mgauss.cli.survey_run import Task
-    tasks = []
-    least = 1 if '--references' in survey.options['motions'] else 2
-    for name, members in survey.fields.items():
-        files = [str(_catalogue(survey, survey.exposures[i]))
-                 for i in members if survey.exposures[i].name in measured]
-        if len(files) < least:
-            continue
-        folder = survey.output / 'motions' / name
-        tasks.append(Task(
-            name, (('motions', *files, *_TO, str(folder),
-                    *survey.options['motions']),), tuple(files),
-            (str(folder / 'motions.ecsv'),),
-            str(survey.output / 'records' / f'{name}.json')))
-    return tasks
+def _cost(survey, kept):
+    """Return a sentence on what is still to be done."""
+    from photutils_mgauss.cli.survey_folder import needed_bytes
+    n = len(survey.exposures) - len(kept)
+    words = f'{n} to do, about {needed_bytes(survey, n) / 1e6:.0f} MB'
+    if not kept or not n:
+        return words
+    hours = n * sum(one.cpu for one in kept) / len(kept) / 3600
+    return (f'{words} and {hours:.2g} core hours, if they are like the '
+            'others')
 
 
 def _run(options, survey):
+    from photutils_mgauss.cli.survey_folder import mark_output
     from photutils_mgauss.cli.survey_run import cluster_workers, local_workers
     start = time.perf_counter()
     workers = (local_workers(options.workers) if options.cluster is None
                else cluster_workers(options.cluster))
-    done = _do(options, exposure_tasks(survey), workers, 'exposures')
-    measured = {name for name, outcome in done.items() if not outcome.error}
-    fields = _do(options, field_tasks(survey, measured), workers, 'fields')
-    _finish(options, survey, done, fields, time.perf_counter() - start)
-    if any(outcome.error for outcome in [*done.values(), *fields.values()]):
+    mark_output(survey)
+    try:
+        psfs, done, fields, pixels = _all_steps(options, survey, workers)
+    finally:
+        workers.close()
+    _finish(options, survey, psfs, done, fields, pixels,
+            time.perf_counter() - start)
+    if any(outcome.error for some in (psfs, done, fields, pixels)
+           for outcome in some.values()):
         msg = (f'{survey.output / "index.html"} lists what failed; the rest '
                'is finished, and the same command tries again')
         raise RuntimeError(msg)
 
 
+def _all_steps(options, survey, workers):
+    """Return the outcomes of all tasks, step by step."""
+    from photutils_mgauss.cli import survey_tasks as tasks
+    psfs = _do(options, tasks.detector_tasks(survey), workers, 'detectors')
+    done = _do(options, tasks.exposure_tasks(survey), workers, 'exposures')
+    fields = _do(options, tasks.field_tasks(survey, _good(done)), workers,
+                 'fields')
+    pixels = _do(options, tasks.pixel_tasks(survey, _good(done),
+                                            _good(fields)), workers, 'pixels')
+    return psfs, done, fields, pixels
+
+
+def _good(outcomes):
+    return {name for name, outcome in outcomes.items() if not outcome.error}
+
+
 def _do(options, tasks, workers, what):
     """Run tasks with a bar, and say at once what goes wrong."""
     from photutils_mgauss.cli.survey_run import run_tasks
+    if not tasks:
+        return {}
     hidden = options.quiet or not sys.stderr.isatty()
     with tqdm(total=len(tasks), desc=what, disable=hidden) as bar:
         def tell(outcome):
             bar.update()
             if outcome.error:
                 tools.say(options, f'{outcome.name}: {outcome.error}')
-        return run_tasks(tasks, workers, tell)
+        done = run_tasks(tasks, workers, tell)
+    # Not in the order in which they came to their end.
+    return {task.name: done[task.name] for task in tasks}
 
 
-def _finish(options, survey, done, fields, seconds):
+def _finish(options, survey, psfs, done, fields, pixels, seconds):
     """Write what people look at."""
     from photutils_mgauss.cli import survey_results as results
-    rows = [results.exposure_row(exposure, done[exposure.name],
-                                 _catalogue(survey, exposure),
-                                 _psf(survey, exposure))
+    from photutils_mgauss.cli.survey_tasks import motions_of
+    rows = [results.exposure_row(exposure, done[exposure.name])
             for exposure in survey.exposures]
-    tables = {name: survey.output / 'motions' / name / 'motions.ecsv'
-              for name in fields}
-    lines = [results.field_row(name, survey.fields[name], fields[name],
-                               tables[name]) for name in fields]
-    failed = sum(bool(one.error) for one in [*done.values(),
-                                             *fields.values()])
-    old = sum(one.skipped for one in [*done.values(), *fields.values()])
+    lines = [results.field_row(name, survey.fields[
+        name.removesuffix('_pixels')], outcome)
+        for name, outcome in (fields | pixels).items()]
+    lines += [results.field_row(name, (), outcome)
+              for name, outcome in psfs.items() if outcome.error]
+    outcomes = [*psfs.values(), *done.values(), *fields.values(),
+                *pixels.values()]
+    failed = sum(bool(one.error) for one in outcomes)
+    old = sum(one.skipped for one in outcomes)
     words = (f'{len(done)} exposures, {len(fields)} fields, {failed} failed, '
              f'{old} of an earlier run, {seconds:.0f} s')
     results.write_index(survey.output, rows, lines, words)
     results.write_summary(survey.output, {
         'exposures': len(done), 'fields': len(fields), 'failed': failed,
-        'kept': old, 'seconds': seconds})
-    said = _dataset(survey, {name: path for name, path in tables.items()
-                             if not fields[name].error})
-    tools.say(options, words, said,
+        'kept': old, 'seconds': seconds,
+        'cpu': sum(one.cpu for one in outcomes if not one.skipped)})
+    results.collect_wcs([motions_of(survey, name).parent
+                         for name in sorted(_good(fields))],
+                        survey.output / 'wcs')
+    tools.say(options, words, _dataset(survey, fields, pixels),
               f'the results are listed in {survey.output / "index.html"}')
 
 
-def _dataset(survey, tables):
+def _dataset(survey, fields, pixels):
     """Write all motions as one dataset; return what is to be said."""
     from photutils_mgauss.cli.survey_results import write_dataset
-    from photutils_mgauss.files.tables import read_table
+    from photutils_mgauss.cli.survey_tasks import motions_of
+    what, outcomes = (('pixels', pixels) if survey.pixels
+                      else ('motions', fields))
+    tables = {}
+    for task in sorted(_good(outcomes)):
+        name = task.removesuffix('_pixels')
+        tables[name] = (motions_of(survey, name, what),
+                        outcomes[task].figures.get('pixels'))
     if not tables:
         return 'no field has motions'
     folder = survey.output / 'motions_hats'
     try:
-        n = write_dataset(folder, ((name, read_table(path)[0])
-                                   for name, path in tables.items()),
-                          'motions')
+        n = write_dataset(folder, tables, 'motions', survey.references)
     except ImportError as error:
         return (f'no Parquet dataset is written ({error}): pip install '
                 "'photutils_mgauss[survey]'")

@@ -1,23 +1,25 @@
 """What a survey file asks for: exposures, fields, and the commands to run."""
-import contextlib
-import io
 import tomllib
 from dataclasses import dataclass
-from difflib import get_close_matches
-from itertools import combinations
 from pathlib import Path
 
-import numpy as np
-from astropy.coordinates import SkyCoord
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-
 from photutils_mgauss.cli import tools
+from photutils_mgauss.cli.footprints import Footprint, connected, overlaps
+from photutils_mgauss.cli.survey_options import (
+    COMMANDS,
+    READING,
+    archive_of,
+    check_keys,
+    check_overlaps,
+    files_of,
+    motion_options,
+    parsed,
+    words,
+)
 
-_TABLES = ('exposures', 'psf', 'photometry', 'motions')
-_EXPOSURE_KEYS = ('files', 'ext', 'group_by', 'overlap')
-# Points along each side of an image by which overlaps are measured.
-_POINTS = 12
+_EXPOSURE_KEYS = ('files', 'ext', 'detector', 'group_by', 'overlap', *READING)
+# So many exposures that cannot be used are named.
+_NAMED = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,32 +27,25 @@ class Exposure:
     """
     One image of a survey.
 
-    ``group`` are the values of the keywords that keep fields apart, ``wcs``
-    its WCS, ``shape`` its pixels (ny, nx).
+    ``group`` are the values of the keywords that keep fields apart,
+    ``detector`` names what took it, ``n_pixels`` is its size.
     """
 
     name: str
     path: Path
     ext: str | None
     group: tuple
+    detector: str
     year: float
-    wcs: object
-    shape: tuple
+    footprint: Footprint
+    n_pixels: int
 
-    def lattice(self):
-        """Return directions of points spread over the image."""
-        y, x = (np.linspace(0, n - 1, _POINTS) for n in self.shape)
-        x, y = (grid.ravel() for grid in np.meshgrid(x, y))
-        return self.wcs.pixel_to_world(x, y)
-
-    def share_inside(self, other):
-        """Return the share of this image that another one shows."""
-        sky = SkyCoord(self.lattice())
-        with np.errstate(all='ignore'):
-            x, y = other.wcs.world_to_pixel(sky)
-        ny, nx = other.shape
-        inside = (x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)
-        return float(np.mean(inside))
+    @property
+    def camera(self):
+        """What has a PSF of its own: detector and group, as a name."""
+        parts = (self.detector or 'detector', *self.group)
+        return '_'.join(''.join(letter if letter.isalnum() else '-'
+                                for letter in part) for part in parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,14 +53,31 @@ class Survey:
     """
     A survey file, read and checked.
 
-    ``options`` has the words of each command, ``fields`` the numbers of the
-    exposures of each field, by the field's name.
+    ``options`` has the words of each command, ``reading`` those for all,
+    ``files`` the files that the words of each command name, ``psf`` is
+    'exposure', 'detector' or 'archive', where ``archive`` has the files by
+    detector, ``fields`` the numbers of the exposures of each field by its
+    name, ``regions`` those of fields that hang together.
     """
 
+    file: Path
     output: Path
     exposures: list
     options: dict
+    reading: tuple
+    files: dict
+    psf: str
+    archive: dict
+    pixels: bool
     fields: dict
+    regions: dict
+
+    @property
+    def references(self):
+        """The file of the objects of known motion, or None."""
+        words = self.options['motions']
+        return (words[words.index('--references') + 1]
+                if '--references' in words else None)
 
 
 def read_survey(path):
@@ -83,81 +95,68 @@ def read_survey(path):
 
     Raises
     ------
-    OSError, ValueError
-        If the file or an exposure cannot be read, a key is unknown, or two
-        exposures have one name.
+    OSError, TypeError, ValueError
+        If the file or an exposure cannot be read, a key is unknown, options
+        contradict each other, a detector has no PSF, or two exposures have
+        one name.
     """
+    text = _toml(path)
+    folder = path.resolve().parent
+    wanted = text.get('exposures', {})
+    tables = _tables(text)
+    given = text.get('photometry', {}).get('psf', 'exposure')
+    archive = archive_of(path, folder, given)
+    options = {name: words(table, folder) for name, table in tables.items()}
+    for name, some in options.items():
+        parsed(path, 'motions' if name == 'pixels' else name, some)
+    reading = words({key: value for key, value in wanted.items()
+                     if key in READING}, folder)
+    exposures = _exposures(path, folder, wanted, parsed(
+        path, 'photometry', reading, 'exposures'))
+    _check_archive(path, exposures, archive)
+    motions = text.get('motions', {})
+    fields, regions = _fields(exposures, float(wanted.get('overlap', 0.5)))
+    if motions.get('pixels'):
+        _check_extensions(path, exposures, fields)
+    return Survey(
+        path.resolve(), folder / text.get('output', 'survey'), exposures,
+        options, reading, {name: files_of(table, folder)
+                           for name, table in tables.items()},
+        'archive' if archive else given, archive,
+        bool(motions.get('pixels')),
+        regions if motions.get('together') else fields, regions)
+
+
+def _toml(path):
+    """Return what a survey file says, if it says nothing wrong."""
     with path.open('rb') as file:
         try:
             text = tomllib.load(file)
         except tomllib.TOMLDecodeError as error:
             msg = f'{path}: must be a TOML file: {error}'
             raise ValueError(msg) from error
-    _check_keys(path, text, ('output', *_TABLES), 'keys')
-    wanted = text.get('exposures', {})
-    _check_keys(path, wanted, _EXPOSURE_KEYS, 'keys of [exposures]')
-    folder = path.resolve().parent
-    options = {name: _words(text.get(name, {}), folder)
-               for name in ('psf', 'photometry', 'motions')}
-    for name, words in options.items():
-        _check_words(path, name, words)
-    exposures = _exposures(path, folder, wanted)
-    return Survey(folder / text.get('output', 'survey'), exposures, options,
-                  _fields(exposures, float(wanted.get('overlap', 0.5))))
+    check_keys(path, text, ('output', 'exposures', *COMMANDS), 'keys')
+    for name in ('exposures', *COMMANDS):
+        if not isinstance(text.get(name, {}), dict):
+            msg = f'{path}: {name} must be a table, [{name}], got {text[name]}'
+            raise TypeError(msg)
+    check_keys(path, text.get('exposures', {}), _EXPOSURE_KEYS,
+               'keys of [exposures]')
+    check_overlaps(path, text)
+    return text
 
 
-def _check_keys(path, table, known, what):
-    for key in table:
-        if key not in known:
-            near = get_close_matches(key, known, 1)
-            hint = f' (did you mean {near[0]}?)' if near else ''
-            msg = (f'{path}: {what} must be among {", ".join(known)}, got '
-                   f'{key}{hint}')
-            raise ValueError(msg)
+def _tables(text):
+    """Return the options of each command."""
+    catalogues, pixels = motion_options(text.get('motions', {}))
+    photometry = {key: value for key, value in
+                  text.get('photometry', {}).items() if key != 'psf'}
+    tables = {'psf': text.get('psf', {}), 'photometry': photometry,
+              'motions': catalogues}
+    return tables | ({'pixels': pixels} if pixels.get('pixels') else {})
 
 
-def _words(options, folder):
-    """
-    Return a table of options as the words of a command line.
-
-    Values that name a file in the folder become whole paths, as workers may
-    be anywhere.
-    """
-    def word(value):
-        file = folder / str(value)
-        return str(file if file.is_file() else value)
-
-    words = []
-    for key, value in options.items():
-        name = f'--{key.replace("_", "-")}'
-        if value is True:
-            words.append(name)
-        elif isinstance(value, list):
-            words += [name, *map(word, value)]
-        elif value is not False:
-            words += [name, word(value)]
-    return tuple(words)
-
-
-def _check_words(path, command, words):
-    """Raise if a command does not know its options."""
-    from photutils_mgauss.cli.survey_steps import step_parser
-    said = io.StringIO()
-    parser = step_parser()
-    with contextlib.redirect_stderr(said):
-        try:
-            _, unknown = parser.parse_known_args([command, 'x', *words])
-        except SystemExit:
-            last = said.getvalue().strip().splitlines()[-1]
-            msg = f'{path}: [{command}]: {last.partition("error: ")[2]}'
-            raise ValueError(msg) from None
-    if unknown:
-        msg = (f'{path}: [{command}] must have options of mgauss {command}, '
-               f'got {unknown[0].removeprefix("--")}')
-        raise ValueError(msg)
-
-
-def _exposures(path, folder, wanted):
+def _exposures(path, folder, wanted, reading):
     patterns = wanted.get('files', [])
     patterns = [patterns] if isinstance(patterns, str) else patterns
     files = sorted({file for pattern in patterns
@@ -166,17 +165,42 @@ def _exposures(path, folder, wanted):
         msg = (f'{path}: files of [exposures] must name images, got none for '
                f'{", ".join(patterns) or "no pattern"}')
         raise ValueError(msg)
-    found = [_exposure(file, ext, wanted.get('group_by', []))
-             for file in files
+    pairs = [(file, ext) for file in files
              for ext in _extensions(file, wanted.get('ext'))]
-    known = {}
-    for exposure in found:
-        other = known.setdefault(exposure.name, exposure)
-        if other is not exposure:
-            msg = (f'{path}: exposures must have different names, got '
-                   f'{exposure.name} for {other.path} and {exposure.path}')
-            raise ValueError(msg)
+    _check_names(path, pairs)
+    found, troubles = [], []
+    for file, ext in pairs:
+        try:
+            found.append(_exposure(file, ext, wanted, reading))
+        except (OSError, ValueError) as error:
+            troubles.append(tools.sentence_of(error))
+    if troubles:
+        msg = '; '.join(troubles[:_NAMED])
+        if len(troubles) > _NAMED:
+            msg += f'; and {len(troubles) - _NAMED} more'
+        raise ValueError(msg)
     return found
+
+
+def _check_names(path, pairs):
+    known = {}
+    for file, ext in pairs:
+        other = known.setdefault(_name(file, ext), file)
+        if other is not file:
+            msg = (f'{path}: exposures must have different names, got '
+                   f'{_name(file, ext)} for {other} and {file}')
+            raise ValueError(msg)
+
+
+def _chip(ext):
+    """Return which of several images of a file an extension is, or ''."""
+    return '' if ext is None or ',' not in str(ext) else (
+        str(ext).replace(',', ''))
+
+
+def _name(file, ext):
+    chip = _chip(ext)
+    return f'{tools.stem(file)}_{chip}' if chip else tools.stem(file)
 
 
 def _matching(folder, pattern):
@@ -198,57 +222,68 @@ def _extensions(file, wanted):
             if len(versions) > 1 else [wanted])
 
 
-def _exposure(file, ext, group_by):
+def _exposure(file, ext, wanted, reading):
     from photutils_mgauss.cli.star_image import Reading, read_image
     from photutils_mgauss.sky.observers import julian_years
     with tools.about(file):
-        image = read_image(file, Reading(ext=ext))
+        image = read_image(file, Reading(ext=ext, **{
+            key: getattr(reading, key) for key in READING}))
         image.check()
         for what, value in (('a WCS', image.wcs), ('a time', image.time)):
             if value is None:
                 msg = f'must have {what} in its header, got none'
                 raise ValueError(msg)
-        group = tuple(_keyword(file, key) for key in group_by)
-    chip = '' if ext is None or ',' not in str(ext) else (
-        '_' + str(ext).replace(',', ''))
-    return Exposure(f'{tools.stem(file)}{chip}', file, ext, group,
-                    float(julian_years(image.time)), image.wcs,
-                    image.data.shape)
+        group = tuple(_keyword(file, key) for key in wanted.get('group_by',
+                                                                []))
+        key = wanted.get('detector')
+        parts = (_chip(ext), '' if key is None else _keyword(file, key))
+        return Exposure(
+            _name(file, ext), file, ext, group, ' '.join(filter(None, parts)),
+            float(julian_years(image.time)),
+            Footprint(image.wcs, image.data.shape), image.data.size)
 
 
 def _keyword(file, key):
     """Return the value of a keyword, from whichever header has it."""
-    from photutils_mgauss.files.image_layers import open_fits
-    with open_fits(file) as hdus:
-        for hdu in hdus:
-            if key in hdu.header:
-                return str(hdu.header[key])
-    msg = f'must have the keyword {key}, which keeps fields apart'
+    from photutils_mgauss.files.image_layers import is_asdf, open_fits
+    if not is_asdf(file):
+        with open_fits(file) as hdus:
+            for hdu in hdus:
+                if key in hdu.header:
+                    return str(hdu.header[key])
+    msg = f'must have the keyword {key}, which keeps exposures apart'
     raise ValueError(msg)
 
 
+def _check_archive(path, exposures, archive):
+    """Raise if there is a detector whose PSF is not given."""
+    if not archive or '' in archive:
+        return
+    for exposure in exposures:
+        if exposure.detector not in archive:
+            msg = (f'{path}: psf of [photometry] must name a file for each '
+                   f'detector, got none for {exposure.detector!r} of '
+                   f'{exposure.path}')
+            raise ValueError(msg)
+
+
+def _check_extensions(path, exposures, fields):
+    """Raise if a field has images of several extensions."""
+    for name, members in fields.items():
+        found = {exposures[i].ext for i in members}
+        if len(found) > 1:
+            msg = (f'{path}: pixels of [motions] must have fields of one '
+                   f'extension, got {", ".join(sorted(map(str, found)))} in '
+                   f'{name}; see group_by')
+            raise ValueError(msg)
+
+
 def _fields(exposures, overlap):
-    """Return the numbers of exposures by field: those that overlap."""
-    pairs = [(i, j) for i, j in combinations(range(len(exposures)), 2)
-             if exposures[i].group == exposures[j].group
-             and _near(exposures[i], exposures[j])
-             and max(exposures[i].share_inside(exposures[j]),
-                     exposures[j].share_inside(exposures[i])) >= overlap]
-    n = len(exposures)
-    rows, columns = np.array(pairs, int).reshape(-1, 2).T
-    _, label = connected_components(coo_matrix(
-        (np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
-    return {f'field{k + 1:04d}': np.flatnonzero(label == k).tolist()
-            for k in range(label.max() + 1)}
-
-
-def _near(one, other):
-    """Whether two images can overlap: their middles are close enough."""
-    middles, reach = [], 0
-    for exposure in (one, other):
-        ny, nx = exposure.shape
-        middle = exposure.wcs.pixel_to_world((nx - 1) / 2, (ny - 1) / 2)
-        corner = exposure.wcs.pixel_to_world(0, 0)
-        middles.append(SkyCoord(middle))
-        reach += middle.separation(corner).deg
-    return middles[0].separation(middles[1]).deg <= reach
+    """Return exposures by field, and by region: fields that touch."""
+    pairs, share = overlaps([one.footprint for one in exposures],
+                            [one.group for one in exposures])
+    return tuple(
+        {f'{what}{k + 1:04d}': members for k, members in enumerate(
+            connected(some, len(exposures)))}
+        for what, some in (('field', pairs[share >= overlap]),
+                           ('region', pairs)))

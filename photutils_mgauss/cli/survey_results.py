@@ -1,5 +1,6 @@
 """What a survey leaves for people: an index page, and one dataset."""
 import json
+import shutil
 from html import escape
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from photutils_mgauss.utils.star_columns import column_values
 
 # Order of the HEALPix pixels that divide the dataset, and of its index.
 _ORDER, _INDEX_ORDER = 5, 29
+# Stars nearer to another pixel than this may have a twin in it [deg].
+_MARGIN = 5 / 3600
 
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
@@ -83,21 +86,12 @@ def _cell(value):
     return escape(str(value))
 
 
-def exposure_row(exposure, outcome, catalogue, psf):
-    """Return the row of an exposure, its figures of merit included."""
-    row = {'exposure': exposure.name, 'year': round(exposure.year, 4),
-           'FWHM [pix]': np.nan, 'ellipticity': np.nan, 'stars': 0,
-           'without flags': np.nan, 'reduced chi2': np.nan,
-           'x_err of bright stars [pix]': np.nan,
-           'trouble': outcome.error or '; '.join(outcome.notes)}
-    if outcome.error:
-        return row
-    from photutils_mgauss.cli.psf_files import read_psf
+def exposure_figures(task):
+    """Return how good an exposure's PSF and catalogue are, by name."""
     from photutils_mgauss.files.tables import read_table
-    from photutils_mgauss.psf.shapes import adaptive_moments
-    table, _ = read_table(catalogue)
+    table, _ = read_table(task.outputs[0])
     good = np.asarray(table['flags']) == 0
-    row |= {'stars': len(table), 'without flags': float(good.mean())}
+    row = {'stars': len(table), 'without flags': float(good.mean())}
     if 'reduced_chi2' in table.colnames and good.any():
         row['reduced chi2'] = float(np.nanmedian(
             column_values(table, 'reduced_chi2')[good]))
@@ -106,45 +100,93 @@ def exposure_row(exposure, outcome, catalogue, psf):
         bright = flux >= np.nanpercentile(flux, 90)
         row['x_err of bright stars [pix]'] = float(np.nanmedian(
             column_values(table, 'x_err')[good][bright]))
-    if psf is not None and psf.exists():
-        shapes = adaptive_moments(read_psf(psf).mixtures)
-        row |= {'FWHM [pix]': float(np.nanmedian(shapes.fwhm)),
-                'ellipticity': float(np.nanmedian(shapes.ellipticity))}
+    words = task.commands[-1]
+    if '--psf' in words:
+        row |= _psf_figures(words[words.index('--psf') + 1])
     return row
 
 
-def field_row(name, members, outcome, motions):
-    """Return the row of a field."""
-    row = {'field': name, 'exposures': len(members), 'stars': 0,
-           'with motions': 0, 'median pmra_error [mas / yr]': np.nan,
-           'trouble': outcome.error or '; '.join(outcome.notes)}
-    if outcome.error:
-        return row
+def _psf_figures(path):
+    from photutils_mgauss.cli.psf_files import psf_kind, read_psf
+    if psf_kind(path) != 'mixtures':
+        # To fit it again for its width alone takes too long.
+        return {}
+    from photutils_mgauss.psf.shapes import adaptive_moments
+    shapes = adaptive_moments(read_psf(path).mixtures)
+    return {'FWHM [pix]': float(np.nanmedian(shapes.fwhm)),
+            'ellipticity': float(np.nanmedian(shapes.ellipticity))}
+
+
+def field_figures(task):
+    """Return how many motions a field has, and where its stars are."""
     from photutils_mgauss.files.tables import read_table
-    table, _ = read_table(motions)
+    table, _ = read_table(task.outputs[0])
     error = column_values(table, 'pmra_error')
     solved = np.isfinite(error)
-    row |= {'stars': len(table), 'with motions': int(solved.sum())}
+    row = {'stars': len(table), 'with motions': int(solved.sum())}
     if solved.any():
         row['median pmra_error [mas / yr]'] = float(np.median(error[solved]))
+    row['pixels'] = pixels_of(table)
     return row
 
 
-def write_dataset(folder, tables, name):
+# What is looked at when a task of a kind is done.
+FIGURES = {'exposure': exposure_figures, 'field': field_figures}
+_EXPOSURE = ('FWHM [pix]', 'ellipticity', 'stars', 'without flags',
+             'reduced chi2', 'x_err of bright stars [pix]')
+_FIELD = ('stars', 'with motions', 'median pmra_error [mas / yr]')
+
+
+def exposure_row(exposure, outcome):
+    """Return the row of an exposure, its figures of merit included."""
+    return {'exposure': exposure.name, 'year': round(exposure.year, 4),
+            **_figures(outcome, _EXPOSURE)}
+
+
+def field_row(name, members, outcome):
+    """Return the row of a field."""
+    return {'field': name, 'exposures': len(members),
+            **_figures(outcome, _FIELD)}
+
+
+def _figures(outcome, names):
+    return {**{name: outcome.figures.get(name, np.nan) for name in names},
+            'trouble': outcome.error or '; '.join(outcome.notes)}
+
+
+def collect_wcs(folders, target):
+    """Copy the corrected WCS of all fields into one folder."""
+    for folder in folders:
+        for pattern in ('*_wcs.asdf', '*_wcs.fits'):
+            for path in sorted(folder.glob(pattern)):
+                copy = target / path.name
+                if (copy.exists() and copy.stat().st_mtime_ns
+                        >= path.stat().st_mtime_ns):
+                    continue
+                with tools.whole_file(copy) as draft:
+                    shutil.copyfile(path, draft)
+
+
+def write_dataset(folder, tables, name, references=None):
     """
     Write tables of stars as one Parquet dataset, divided by HEALPix pixel.
 
     In the HATS layout: ``dataset/Norder=5/Dir=D/Npix=N.parquet``, the column
-    ``_healpix_29``, ``partition_info.csv`` and ``hats.properties``.
+    ``_healpix_29``, ``partition_info.csv`` and ``hats.properties``. Stars of
+    several fields are merged, see `merge_stars`. One pixel is in memory at a
+    time.
 
     Parameters
     ----------
     folder : `~pathlib.Path`
         The dataset's own folder.
-    tables : iterable of (str, `~astropy.table.QTable`)
-        Tables with ``ra`` and ``dec``, by the name of their field.
+    tables : dict
+        By the name of a field, the file of its table, which has ``ra`` and
+        ``dec``, and the pixels that it reaches, as of `pixels_of`.
     name : str
         What the dataset is called.
+    references : str, optional
+        The file of the objects of known motion of all fields.
 
     Returns
     -------
@@ -158,16 +200,22 @@ def write_dataset(folder, tables, name):
     """
     import pyarrow as pa
     from pyarrow import parquet
-    pieces = {}
-    for field, table in tables:
-        for pixel, rows in _by_pixel(table):
-            pieces.setdefault(pixel, []).append(_arrow(table[rows], field))
+
+    from photutils_mgauss.files.tables import read_table
+    known = None if references is None else read_table(references)[0]
+    wanted = {}
+    for field, (path, pixels) in tables.items():
+        for pixel in pixels if pixels is not None else _pixels_of_file(path):
+            wanted.setdefault(pixel, []).append((field, path))
     counts = {}
-    for pixel, parts in sorted(pieces.items()):
-        whole = pa.concat_tables(parts, promote_options='default')
-        whole = whole.sort_by(f'_healpix_{_INDEX_ORDER}')
+    for pixel, fields in sorted(wanted.items()):
+        parts = _in_pixel(pixel, fields, known)
         path = (folder / 'dataset' / f'Norder={_ORDER}'
                 / f'Dir={pixel // 10000 * 10000}' / f'Npix={pixel}.parquet')
+        if not parts:
+            continue
+        whole = pa.concat_tables(parts, promote_options='default')
+        whole = whole.sort_by(f'_healpix_{_INDEX_ORDER}')
         with tools.whole_file(path) as draft:
             parquet.write_table(whole, draft)
         counts[pixel] = whole.num_rows
@@ -175,20 +223,68 @@ def write_dataset(folder, tables, name):
     return sum(counts.values())
 
 
+def _in_pixel(pixel, fields, references):
+    """Return the stars of fields in a pixel, merged, for Parquet."""
+    from photutils_mgauss.motions.merged import merge_stars
+    names, tables = [], []
+    for field, path in fields:
+        table = _read(path)
+        near = np.any(_pixels_around(table) == pixel, axis=0)
+        if near.any():
+            names.append(field)
+            tables.append(table[near])
+    if not tables:
+        return []
+    return [_arrow(table[_index(table, _ORDER) == pixel], field)
+            for field, table in zip(names, merge_stars(tables, references),
+                                    strict=True)
+            if (_index(table, _ORDER) == pixel).any()]
+
+
+def _read(path):
+    from photutils_mgauss.files.tables import read_table
+    table, _ = read_table(path)
+    return table[np.isfinite(column_values(table, 'ra'))
+                 & np.isfinite(column_values(table, 'dec'))]
+
+
+def _pixels_of_file(path):
+    return _pixels_in(_read(path))
+
+
+def pixels_of(table):
+    """Return the pixels that stars are in or near, None if unknown."""
+    try:
+        import astropy_healpix  # noqa: F401
+    except ImportError:
+        return None
+    return _pixels_in(table[np.isfinite(column_values(table, 'ra'))
+                            & np.isfinite(column_values(table, 'dec'))])
+
+
+def _pixels_in(table):
+    return np.unique(_pixels_around(table)).tolist()
+
+
+def _pixels_around(table):
+    """Return pixels (5, n) of stars and of places around them."""
+    ra, dec = (column_values(table, name) for name in ('ra', 'dec'))
+    wide = _MARGIN / np.cos(np.radians(np.clip(dec, -89.9, 89.9)))
+    return np.stack([_healpix(ra + i * wide, np.clip(dec + j * _MARGIN, -90,
+                                                     90), _ORDER)
+                     for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))])
+
+
 def _index(table, order):
+    return _healpix(column_values(table, 'ra'), column_values(table, 'dec'),
+                    order)
+
+
+def _healpix(ra, dec, order):
     import astropy.units as u
     from astropy_healpix import lonlat_to_healpix
-    return np.asarray(lonlat_to_healpix(
-        column_values(table, 'ra') * u.deg, column_values(table, 'dec')
-        * u.deg, 2**order, order='nested'))
-
-
-def _by_pixel(table):
-    """Return (pixel, rows) of the stars that have a place."""
-    placed = np.flatnonzero(np.isfinite(column_values(table, 'ra'))
-                            & np.isfinite(column_values(table, 'dec')))
-    pixel = _index(table[placed], _ORDER)
-    return [(int(one), placed[pixel == one]) for one in np.unique(pixel)]
+    return np.asarray(lonlat_to_healpix(ra * u.deg, dec * u.deg, 2**order,
+                                        order='nested'))
 
 
 def _arrow(table, field):

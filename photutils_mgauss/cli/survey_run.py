@@ -7,8 +7,10 @@ changes, and its outputs are there, it is not run again.
 """
 import json
 import multiprocessing
+import os
 import time
 import warnings
+from collections import deque
 from concurrent.futures import (
     FIRST_COMPLETED,
     Future,
@@ -16,8 +18,9 @@ from concurrent.futures import (
     wait,
 )
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from threading import Thread
 
 from photutils_mgauss.cli import tools
 from photutils_mgauss.cli.results import file_marks
@@ -41,6 +44,8 @@ class Task:
         Files that they read and write.
     record : str
         The file of its record.
+    kind : str, optional
+        What is looked at when it is done, of `survey_results.FIGURES`.
     """
 
     name: str
@@ -48,11 +53,18 @@ class Task:
     inputs: tuple
     outputs: tuple
     record: str
+    kind: str = ''
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a task ended: ``error`` is a sentence, empty if all went well."""
+    """
+    How a task ended.
+
+    ``error`` is a sentence, empty if all went well; ``seconds`` are those of
+    the clock, ``cpu`` those of the processor; ``figures`` say how good the
+    results are.
+    """
 
     name: str
     error: str = ''
@@ -60,6 +72,8 @@ class Outcome:
     notes: tuple = ()
     digest: str = ''
     skipped: bool = False
+    cpu: float = 0.0
+    figures: dict = field(default_factory=dict)
 
 
 def run_task(task):
@@ -75,14 +89,28 @@ def run_task(task):
     known = kept_outcome(task)
     if known is not None and known.digest == digest:
         return known
-    start = time.perf_counter()
+    start, cpu = time.perf_counter(), time.process_time()
     error, notes = _run(task)
-    outcome = Outcome(task.name, error, time.perf_counter() - start,
-                      tuple(notes), digest)
-    if not error:
-        with tools.whole_file(Path(task.record)) as draft:
-            draft.write_text(json.dumps(asdict(outcome)), encoding='utf-8')
+    try:
+        figures = {} if error else _figures(task)
+        outcome = Outcome(task.name, error, time.perf_counter() - start,
+                          tuple(notes), digest,
+                          cpu=time.process_time() - cpu, figures=figures)
+        if not error:
+            with tools.whole_file(Path(task.record)) as draft:
+                draft.write_text(json.dumps(asdict(outcome)),
+                                 encoding='utf-8')
+    except (OSError, ValueError) as problem:
+        return Outcome(task.name, tools.sentence_of(problem))
     return outcome
+
+
+def _figures(task):
+    """Return the figures of merit of what a task made."""
+    if not task.kind:
+        return {}
+    from photutils_mgauss.cli.survey_results import FIGURES
+    return FIGURES[task.kind](task)
 
 
 def kept_outcome(task):
@@ -152,22 +180,41 @@ class Workers:
     Attributes
     ----------
     make : callable
-        Returns an executor; called again where one broke.
+        Returns an executor for one task at a time; called again where one
+        broke.
     number : int
-        How many tasks are given to it at a time.
+        How many of them there are.
+    close : callable, optional
+        Called when all is done.
     """
 
     make: object
     number: int
+    close: object = lambda: None
 
 
 def local_workers(number):
     """Return so many processes of this machine, or this one for one."""
     if number == 1:
         return Workers(Inline, 1)
+    from photutils_mgauss.utils.parallel import available_cores
     context = multiprocessing.get_context('spawn')
-    return Workers(lambda: ProcessPoolExecutor(number, mp_context=context),
-                   number)
+    share = max(1, available_cores() // number)
+    # A pool for each: where a process dies, its pool dies with it.
+    return Workers(lambda: ProcessPoolExecutor(
+        1, mp_context=context, initializer=_begin, initargs=(share,)), number)
+
+
+def _begin(cores):
+    """Prepare a process: so many cores, and an end with who started it."""
+    from photutils_mgauss.utils.parallel import limit_cores
+    limit_cores(cores)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent():
+    multiprocessing.parent_process().join()
+    os._exit(1)
 
 
 def cluster_workers(address):
@@ -199,8 +246,10 @@ def cluster_workers(address):
     if not number:
         msg = f'--cluster must have workers, got none at {address}'
         raise ValueError(msg)
-    # The same task may be asked for again after a failure.
-    return Workers(lambda: client.get_executor(pure=False), 2 * number)
+    # The same task may be asked for again after a failure; two for each
+    # worker, so that the next one is there when one is done.
+    return Workers(lambda: client.get_executor(pure=False), 2 * number,
+                   client.close)
 
 
 def run_tasks(tasks, workers, tell):
@@ -222,32 +271,40 @@ def run_tasks(tasks, workers, tell):
         By the names of the tasks. One that fails harms no other.
     """
     done, deaths = {}, {}
-    waiting, running = list(tasks), {}
-    executor = workers.make()
-    while waiting or running:
-        while waiting and len(running) < workers.number:
-            task = waiting.pop(0)
-            running[executor.submit(run_task, task)] = task
-        finished, _ = wait(running, return_when=FIRST_COMPLETED)
-        errors = []
-        for future in finished:
-            task, error = running.pop(future), future.exception()
-            outcome = future.result() if error is None else _after(
-                task, error, deaths)
-            if outcome is None:
-                waiting.insert(0, task)
-            else:
-                done[task.name] = outcome
-                tell(outcome)
-            errors.append(error)
-        if any(isinstance(error, BrokenProcessPool) for error in errors):
-            # A process that dies takes its pool along, not other tasks.
-            executor.shutdown(wait=False, cancel_futures=True)
-            waiting = [*running.values(), *waiting]
-            running.clear()
-            executor = workers.make()
-    executor.shutdown(wait=True)
+    waiting, running = deque(tasks), {}
+    slots = [workers.make() for _ in range(min(workers.number, len(tasks)))]
+    free = list(range(len(slots)))
+    try:
+        while waiting or running:
+            while waiting and free:
+                slot, task = free.pop(), waiting.popleft()
+                running[_submit(slots, slot, workers, task)] = slot, task
+            finished, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in finished:
+                slot, task = running.pop(future)
+                free.append(slot)
+                error = future.exception()
+                outcome = future.result() if error is None else _after(
+                    task, error, deaths)
+                if outcome is None:
+                    waiting.appendleft(task)
+                else:
+                    done[task.name] = outcome
+                    tell(outcome)
+    finally:
+        for executor in slots:
+            executor.shutdown(wait=True)
     return done
+
+
+def _submit(slots, slot, workers, task):
+    """Return the future of a task, in a new process if the old one died."""
+    try:
+        return slots[slot].submit(run_task, task)
+    except BrokenProcessPool:
+        slots[slot].shutdown(wait=False)
+        slots[slot] = workers.make()
+        return slots[slot].submit(run_task, task)
 
 
 def _after(task, error, deaths):

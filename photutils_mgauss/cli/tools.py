@@ -8,6 +8,7 @@ import sys
 import textwrap
 import warnings
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -139,6 +140,16 @@ def number_or_auto(text):
     return _whole_number(text, 0, ' or auto')
 
 
+def transform(text):
+    """Return the name of a kind of map, for argparse."""
+    if not re.fullmatch(r'none|shift|rigid|similarity|affine|poly-[1-9]\d*',
+                        text):
+        msg = ('must be none, shift, rigid, similarity, affine or poly-2, '
+               f'poly-3, ..., got {text}')
+        raise argparse.ArgumentTypeError(msg)
+    return text
+
+
 def _whole_number(text, least, more=''):
     try:
         value = int(text)
@@ -248,12 +259,14 @@ def read_images(options, paths):
         'exposure_time', 'saturation', 'sky_box')}
     common['time_key'] = getattr(options, 'time_key', None)
 
-    def read(i):
-        """Read an image."""
+    def read(i, ext=None):
+        """Read an image, of several in a file that of an extension."""
         beside = {name: some[i] for name, some in files.items()}
+        reading = Reading(**beside, **common, time=times[i])
+        if ext is not None:
+            reading = replace(reading, ext=ext)
         with about(paths[i]):
-            return read_image(paths[i], Reading(**beside, **common,
-                                                time=times[i]))
+            return read_image(paths[i], reading)
     return read
 
 

@@ -154,8 +154,8 @@ class MixtureField(Field):
     <MixtureField(n_components=1, degree=0, shape=(50, 55), 2 of 2 stars)>
     >>> field.to_grid((3, 4)).grid_shape
     (3, 4)
-    >>> bool(abs(field.stars['x_fit'] - stars['x']).max() < 1e-3)
-    True
+    >>> field.stars['x_fit'].round(3).tolist()
+    [12.3, 40.1]
     >>> print(round(field.aperture_correction(2, 20, 20), 2))
     1.46
     """

@@ -176,14 +176,45 @@ def _read_fits(path, ext, named):
     return layers
 
 
-def _science(path, hdus, ext):
+def science_images(path):
+    """
+    Return what the images of a file are called that show the sky.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A FITS or ASDF file.
+
+    Returns
+    -------
+    list of str
+        What `read_layers` takes as ``ext``; none for ASDF, which has one.
+
+    Raises
+    ------
+    OSError, ValueError
+        If the file cannot be read.
+    """
+    with undamaged(path, _IMAGE):
+        if is_asdf(path):
+            return []
+        with open_fits(path, _IMAGE) as hdus:
+            return [label_of(hdus, hdu) for hdu in _all_science(hdus)]
+
+
+def _all_science(hdus):
+    """Return the images that are not errors or flags of others."""
     images = [hdu for hdu in hdus if _is_image(hdu)]
-    if ext is not None:
-        return _chosen(path, hdus, images, ext)
     science = [hdu for hdu in images if hdu.name in ('SCI', 'SCIENCE')]
-    others = [hdu for hdu in images if hdu.name not in
-              (*_NOISE, *_FLAGS, 'WHT', 'CTX', 'CON')]
-    found = science or others
+    return science or [hdu for hdu in images if hdu.name not in
+                       (*_NOISE, *_FLAGS, 'WHT', 'CTX', 'CON')]
+
+
+def _science(path, hdus, ext):
+    if ext is not None:
+        images = [hdu for hdu in hdus if _is_image(hdu)]
+        return _chosen(path, hdus, images, ext)
+    found = _all_science(hdus)
     if len(found) == 1:
         return found[0]
     if not found:

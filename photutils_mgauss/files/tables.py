@@ -10,6 +10,12 @@ __all__ = ['read_table']
 _FITS_MARKS = (b'SIMPLE', b'\x1f\x8b')
 
 
+def is_fits(path):
+    """Whether a file begins as those of FITS do, or is compressed."""
+    with Path(path).open('rb') as file:
+        return file.read(6).startswith(_FITS_MARKS)
+
+
 def read_table(path):
     """
     Return a table and the record of the run that made it.
@@ -32,17 +38,21 @@ def read_table(path):
     ValueError
         If it is damaged or no table.
     """
+    from astropy.io.registry import IORegistryError
     from astropy.table import QTable
     what = 'a table that astropy can read'
     with undamaged(path, what):
-        with Path(path).open('rb') as file:
-            start = file.read(6)
-        if start.startswith(_FITS_MARKS):
+        if is_fits(path):
             # Checks the sizes that the headers tell of.
             with open_fits(path, what):
                 table = QTable.read(path)
         else:
-            table = QTable.read(path)
+            try:
+                table = QTable.read(path)
+            except IORegistryError as error:
+                # Its own words are followed by all formats there are.
+                msg = 'a file of none of the kinds that it recognises'
+                raise OSError(msg) from error
         text = table.meta.get('MGRUN')
         record = (table.meta.get('mgauss', {}) if text is None
                   else json.loads(text))

@@ -46,8 +46,8 @@ def bootstrap_median(values, *, n_resamples=10000, rng=None):
     >>> from photutils_mgauss import bootstrap_median
     >>> values = np.random.default_rng(1).normal(size=400)
     >>> draws = bootstrap_median(values, rng=2)
-    >>> bool(abs(draws.std() - np.sqrt(np.pi / 2 / 400)) < 0.02)
-    True
+    >>> print(f'{draws.std():.3f}')  # on average sqrt(pi / 800) = 0.063
+    0.049
     """
     n_resamples = as_integer(n_resamples, 'n_resamples', minimum=1)
     values = as_floats(values, 'values', shape=(None,), finite=False)

@@ -10,6 +10,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss.motions.bootstrap import bootstrap_frames
 from photutils_mgauss.motions.corrected_epochs import correct_epochs
+from photutils_mgauss.motions.detectors import detector_residuals
 from photutils_mgauss.motions.doubts import doubts, remarks
 from photutils_mgauss.motions.loop import (
     Fit,
@@ -24,11 +25,12 @@ from photutils_mgauss.motions.propagation import (
 from photutils_mgauss.motions.tables import (
     FLAGS,
     alignment_table,
+    difference_table,
     mean_table,
     membership_table,
     residual_table,
     star_table,
-    validation_table,
+    used_references,
 )
 from photutils_mgauss.sky.observers import julian_years, tdb
 from photutils_mgauss.utils.notebook import with_table
@@ -128,16 +130,25 @@ class MotionSolution:
     >>> solution = ProperMotionFitter(references=quasars).fit(epochs)
     >>> solution
     <MotionSolution: 50 of 50 stars, 3 epochs>
-    >>> solution.stars['pmra', 'pmra_error', 'pmra_pmdec_corr'].colnames
-    ['pmra', 'pmra_error', 'pmra_pmdec_corr']
+    >>> stars = solution.stars[solution.stars['reference'] == '']
+    >>> for name in ('pmra', 'pmra_error', 'pmra_pmdec_corr'):
+    ...     stars[name].info.format = '.2f'
+    >>> stars['pmra', 'pmra_error', 'pmra_pmdec_corr'][:2].pprint()
+      pmra   pmra_error pmra_pmdec_corr
+    mas / yr  mas / yr
+    -------- ---------- ---------------
+        3.19       0.88            0.02
+      -19.54       0.25            0.03
     >>> solution.residuals['epoch', 'dra', 'ddec'].colnames
     ['epoch', 'dra', 'ddec']
 
     Positions at another time, with the errors of then:
 
-    >>> later = solution.at(2030.0)
-    >>> bool((later['ra_error'] > solution.stars['ra_error']).all())
-    True
+    >>> later = solution.at(2040.0)
+    >>> for table in (solution.stars, later):
+    ...     print(table['ra_error'][table['reference'] == ''][0].round(2))
+    1.29 mas
+    11.69 mas
     """
 
     stars: QTable
@@ -315,7 +326,39 @@ class MotionSolution:
             their errors, those of the catalogue included, and ``chi2`` of
             two degrees of freedom.
         """
-        return validation_table(self._fit, self.stars)
+        return difference_table(self._fit, self.stars, self._fit.setup.held)
+
+    def reference_differences(self):
+        """
+        Compare the references in use with their catalogue.
+
+        Their motions are those of `measured`, for which the catalogue says
+        nothing but where the frames are. As the references tie the frames,
+        a few of them agree better than their errors say.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            As `validation`, with a row for each reference of known motion.
+        """
+        if self._fit.setup.relative:
+            which = np.zeros(0, dtype=int)
+        else:
+            which = used_references(self._fit)
+        return difference_table(self._fit, self.measured(), which)
+
+    def detector_residuals(self):
+        """
+        Return the residuals in the pixels of the detectors.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            With the rows of ``residuals``: ``chip``, the pixel ``x_pix`` and
+            ``y_pix``, and the residual ``dx_pix`` and ``dy_pix``. Detections
+            that came as places on the sky have NaN.
+        """
+        return detector_residuals(self.residuals, self.epochs)
 
     def bootstrap(self, n_resamples=10000, *, rng=None):
         """

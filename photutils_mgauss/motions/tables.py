@@ -78,13 +78,27 @@ def groups_in_time(years, gap, used):
     return count
 
 
-def validation_table(fit, stars):
-    """Return held-out references beside their catalogue values."""
-    sightings, held = fit.setup.sightings, fit.setup.held
+def used_references(fit):
+    """Return the numbers of the references in use whose motion is known."""
+    sightings = fit.setup.sightings
+    left_out = np.union1d(fit.setup.held, fit.state.dropped)
+    known = sightings.catalogue.kinds != 'position'
+    numbers = sightings.references[known]
+    return numbers[~np.isin(numbers, left_out)]
+
+
+def difference_table(fit, stars, which):
+    """
+    Return the motions of references less those of their catalogue.
+
+    ``stars`` is a table of all stars, ``which`` the numbers of references
+    that say nothing in it.
+    """
+    sightings = fit.setup.sightings
     unit = u.Unit(sightings.unit) / u.yr
     year = float(stars['ref_epoch'][0].value)
-    motion, covariance = _catalogue_motions(sightings, held, year)
-    rows = stars[held]
+    motion, covariance = _catalogue_motions(sightings, which, year)
+    rows = stars[which]
     table = QTable({'id': rows['id']})
     away, errors = [], []
     for k, name in enumerate(('pmra', 'pmdec')):

@@ -33,6 +33,8 @@ from photutils_mgauss.plotting.motions import (
     plot_motion_errors,
     plot_motions_by_magnitude,
     plot_proper_motions,
+    plot_reference_differences,
+    plot_residual_map,
     plot_residual_vectors,
 )
 from photutils_mgauss.plotting.posterior import (
@@ -70,8 +72,10 @@ __all__ = [
     'plot_proper_motions',
     'plot_psf_image',
     'plot_radial_profile',
+    'plot_reference_differences',
     'plot_residual',
     'plot_residual_image',
+    'plot_residual_map',
     'plot_residual_vectors',
     'plot_shape_map',
     'plot_stated_errors',

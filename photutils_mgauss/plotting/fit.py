@@ -40,6 +40,17 @@ def plot_projection(fit, image, *, axis='x', oversampling=1, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import GaussianMixture, fit_mixture, plotting
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0.3], [0.3, 1.5]]])
+    >>> image = psf.render((15, 15), 7, 7)
+    >>> fit = fit_mixture(image, 1)
+    >>> ax = plotting.plot_projection(fit, image, ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('x [pix]', 'projected flux density')
     """
     ax = current_axes(ax)
     image, _ = read_quantity(image, 'image')
@@ -87,6 +98,17 @@ def plot_profile(fit, image, *, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import GaussianMixture, fit_mixture, plotting
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0.3], [0.3, 1.5]]])
+    >>> image = psf.render((15, 15), 7, 7)
+    >>> fit = fit_mixture(image, 1)
+    >>> ax = plotting.plot_profile(fit, image, ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('x [image pixel]', 'flux density / peak')
     """
     ax = current_axes(ax)
     image, _ = read_quantity(image, 'image')
@@ -131,6 +153,17 @@ def plot_residual(fit, *, peak=None, limit=None, label=None, ax=None):
     -------
     `~matplotlib.axes.Axes`
         Its Axes, with a colour bar beside them.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import GaussianMixture, fit_mixture, plotting
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0.3], [0.3, 1.5]]])
+    >>> image = psf.render((15, 15), 7, 7)
+    >>> fit = fit_mixture(image, 1)
+    >>> ax = plotting.plot_residual(fit, ax=Figure().add_subplot())
+    >>> len(ax.images)
+    1
     """
     ax = current_axes(ax)
     shown = _draw_residual(ax, fit, peak, limit, label)
@@ -172,6 +205,17 @@ def plot_comparison_of_numbers(image, table, *, axes=None):
     ------
     ValueError
         If there are more or fewer Axes than that.
+
+    Examples
+    --------
+    >>> from photutils_mgauss import (
+    ...     GaussianMixture, compare_n_components, plotting)
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0.3], [0.3, 1.5]]])
+    >>> image = psf.render((15, 15), 7, 7)
+    >>> table = compare_n_components(image, (1, 2))
+    >>> axes = plotting.plot_comparison_of_numbers(image, table)
+    >>> axes.shape
+    (3,)
     """
     image, _ = read_quantity(image, 'image')
     if axes is None:
@@ -217,6 +261,15 @@ def plot_mixture(mixture, *, radius=None, decades=4, pixel_integrated=False,
     -------
     `~matplotlib.axes.Axes`
         Its Axes, with a colour bar beside them.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import GaussianMixture, plotting
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0.3], [0.3, 1.5]]])
+    >>> ax = plotting.plot_mixture(psf, ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('x [pix]', 'y [pix]')
     """
     ax = current_axes(ax)
     if radius is None:
@@ -249,6 +302,15 @@ def plot_ellipses(mixture, *, n_sigma=1, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import GaussianMixture, plotting
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0.3], [0.3, 1.5]]])
+    >>> ax = plotting.plot_ellipses(psf, ax=Figure().add_subplot())
+    >>> len(ax.lines)
+    2
     """
     ax = current_axes(ax)
     angle = np.linspace(0, 2 * np.pi, 100)

@@ -52,6 +52,25 @@ def plot_node_map(psf, column='size_error', *, layout=None, ax=None):
     ------
     ValueError
         If ``layout`` has no place for a detector.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.nddata import NDData
+    >>> from matplotlib.figure import Figure
+    >>> from photutils.psf import GriddedPSFModel
+    >>> from photutils_mgauss import (
+    ...     GaussianMixture, GriddedMixturePSF, plotting)
+    >>> wide = GaussianMixture([1], [[0, 0]], [[[6, 0.8], [0.8, 7]]])
+    >>> library = GriddedPSFModel(NDData(
+    ...     np.array([4 * wide.render((25, 25), 12, 12)] * 4),
+    ...     meta={'grid_xypos': [(0, 0), (99, 0), (0, 99), (99, 99)],
+    ...           'oversampling': 2}))
+    >>> psf = GriddedMixturePSF.from_gridded_psf(library, n_components=1)
+    >>> ax = plotting.plot_node_map(psf, 'size_error',
+    ...                             ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('x [pix]', 'y [pix]')
     """
     ax = current_axes(ax)
     psfs, places = _laid_out(psf, layout)
@@ -93,6 +112,18 @@ def plot_whiskers(psf, *, layout=None, scale=None, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import (
+    ...     GaussianMixture, GriddedMixturePSF, plotting)
+    >>> mixtures = [GaussianMixture([1], [[0, 0]], [[[v, 0.3], [0.3, 1.5]]])
+    ...             for v in (1.4, 1.6, 1.8, 2.0)]
+    >>> psf = GriddedMixturePSF(mixtures, [(0, 0), (99, 0), (0, 99), (99, 99)])
+    >>> ax = plotting.plot_whiskers(psf, ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('x [pix]', 'y [pix]')
     """
     ax = current_axes(ax)
     psfs, places = _laid_out(psf, layout)
@@ -148,6 +179,24 @@ def plot_worst_node(psf, source, column='size_error', *, ax=None):
     -------
     `~matplotlib.axes.Axes`
         The same, with ePSF minus mixture in per cent of the ePSF's peak.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.nddata import NDData
+    >>> from matplotlib.figure import Figure
+    >>> from photutils.psf import GriddedPSFModel
+    >>> from photutils_mgauss import (
+    ...     GaussianMixture, GriddedMixturePSF, plotting)
+    >>> wide = GaussianMixture([1], [[0, 0]], [[[6, 0.8], [0.8, 7]]])
+    >>> library = GriddedPSFModel(NDData(
+    ...     np.array([4 * wide.render((25, 25), 12, 12)] * 4),
+    ...     meta={'grid_xypos': [(0, 0), (99, 0), (0, 99), (99, 99)],
+    ...           'oversampling': 2}))
+    >>> psf = GriddedMixturePSF.from_gridded_psf(library, n_components=1)
+    >>> ax = plotting.plot_worst_node(psf, library, ax=Figure().add_subplot())
+    >>> ax.get_title().partition(', $')[0]
+    'node (0, 0)'
     """
     ax = current_axes(ax)
     report = psf.report
@@ -188,6 +237,18 @@ def plot_width_map(psf, *, stars=None, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import (
+    ...     GaussianMixture, GriddedMixturePSF, plotting)
+    >>> mixtures = [GaussianMixture([1], [[0, 0]], [[[v, 0.3], [0.3, 1.5]]])
+    ...             for v in (1.4, 1.6, 1.8, 2.0)]
+    >>> psf = GriddedMixturePSF(mixtures, [(0, 0), (99, 0), (0, 99), (99, 99)])
+    >>> ax = plotting.plot_width_map(psf, ax=Figure().add_subplot())
+    >>> ax.get_title()
+    'FWHM: median 2.978, range 0.28 pix'
     """
     ax = current_axes(ax)
     fwhm = np.atleast_1d(adaptive_moments(psf.mixtures).fwhm)
@@ -222,6 +283,18 @@ def plot_psf_image(psf, x, y, *, radius=8, decades=4, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import (
+    ...     GaussianMixture, GriddedMixturePSF, plotting)
+    >>> mixtures = [GaussianMixture([1], [[0, 0]], [[[v, 0.3], [0.3, 1.5]]])
+    ...             for v in (1.4, 1.6, 1.8, 2.0)]
+    >>> psf = GriddedMixturePSF(mixtures, [(0, 0), (99, 0), (0, 99), (99, 99)])
+    >>> ax = plotting.plot_psf_image(psf, 30, 40, ax=Figure().add_subplot())
+    >>> ax.get_title()
+    'the PSF at (30, 40)'
     """
     ax = plot_mixture(psf.mixture_at(x, y), radius=radius, decades=decades,
                       pixel_integrated=psf.pixel_integrated, ax=ax)
@@ -250,6 +323,19 @@ def plot_radial_profile(psf, x, y, *, radius=8, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import (
+    ...     GaussianMixture, GriddedMixturePSF, plotting)
+    >>> mixtures = [GaussianMixture([1], [[0, 0]], [[[v, 0.3], [0.3, 1.5]]])
+    ...             for v in (1.4, 1.6, 1.8, 2.0)]
+    >>> psf = GriddedMixturePSF(mixtures, [(0, 0), (99, 0), (0, 99), (99, 99)])
+    >>> ax = plotting.plot_radial_profile(psf, 30, 40,
+    ...                                   ax=Figure().add_subplot())
+    >>> ax.get_ylabel()
+    'flux in a pixel / flux of the star'
     """
     ax = current_axes(ax)
     distance = np.linspace(0, radius, 200)
@@ -290,6 +376,19 @@ def plot_shape_map(x, y, values, *, label, ax=None):
     -------
     `~matplotlib.axes.Axes`
         Its Axes, with a colour bar beside them.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import plotting
+    >>> rng = np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 100, (2, 30))
+    >>> ax = plotting.plot_shape_map(x, y, rng.normal(0, 0.01, 30),
+    ...                              label='size error',
+    ...                              ax=Figure().add_subplot())
+    >>> ax.get_title().partition(':')[0]
+    'size error'
     """
     ax = current_axes(ax)
     values = np.asarray(values, float)

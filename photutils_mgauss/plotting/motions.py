@@ -1,7 +1,13 @@
 """Figures of epochs and proper motions."""
 import numpy as np
 
-from photutils_mgauss.plotting.style import BLUE, ORANGE, current_axes
+from photutils_mgauss.plotting.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    ORANGE,
+    current_axes,
+)
 
 __all__ = [
     'plot_cutouts',
@@ -9,11 +15,17 @@ __all__ = [
     'plot_motion_errors',
     'plot_motions_by_magnitude',
     'plot_proper_motions',
+    'plot_reference_differences',
+    'plot_residual_map',
     'plot_residual_vectors',
 ]
 
+# Detections in a cell of a map of residuals, at least.
+_ENOUGH = 5
 
-def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
+
+def plot_residual_vectors(solution, epoch, *, scale=None, title=None,
+                          ax=None):
     """
     Draw the residuals of one epoch's references and stars as arrows.
 
@@ -26,6 +38,8 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     scale : float, optional
         Residual [mas] as long as a tenth of the field, which the key shows;
         the default is three times the median residual.
+    title : str, optional
+        What the epoch is called; the default is its number.
     ax : `~matplotlib.axes.Axes`, optional
         Where to draw; None is pyplot's current Axes.
 
@@ -33,6 +47,30 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     -------
     `~matplotlib.axes.Axes`
         Its Axes; rejected detections are orange.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import Epoch, ProperMotionFitter, plotting
+    >>> rng = np.random.default_rng(1)
+    >>> place, motion = rng.uniform(0, 900, (2, 60)), rng.normal(0, 1, (2, 60))
+    >>> motion[:, :20] = 0  # quasars
+    >>> epochs = []
+    >>> for year in (2020.0, 2022.0, 2025.0):
+    ...     x, y = (place + motion * (year - 2022)
+    ...             + rng.normal(0, 0.02, (2, 60)))
+    ...     epochs.append(Epoch(Table({
+    ...         'id': np.arange(60), 'x_fit': x, 'y_fit': y,
+    ...         'x_err': np.full(60, 0.02), 'y_err': np.full(60, 0.02)}),
+    ...         time=year))
+    >>> fitter = ProperMotionFitter(references=range(20))
+    >>> solution = fitter.fit(epochs)
+    >>> ax = plotting.plot_residual_vectors(solution, 0,
+    ...                                     ax=Figure().add_subplot())
+    >>> ax.get_title(loc='left')
+    'epoch 0'
     """
     ax = current_axes(ax)
     rows = solution.residuals[solution.residuals['epoch'] == epoch]
@@ -51,11 +89,105 @@ def plot_residual_vectors(solution, epoch, *, scale=None, ax=None):
     ax.update_datalim(np.column_stack([x + u / unit, y + v / unit])[good])
     ax.autoscale_view()
     ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal')
-    ax.set_title(f'epoch {epoch}', loc='left')
+    ax.set_title(f'epoch {epoch}' if title is None else title, loc='left')
     ax.invert_xaxis()
     ax.quiverkey(arrows, 0.85, 1.04, scale, f'{scale:.2g} {rows["dra"].unit}',
                  labelpos='W', color=BLUE)
     return ax
+
+
+def plot_residual_map(residuals, chip='', *, n_cells=6, scale=None, ax=None):
+    """
+    Draw the mean residuals in the cells of a detector as arrows.
+
+    What is the same in all exposures, such as a distortion that no WCS has,
+    stands out against the noise of single detections.
+
+    Parameters
+    ----------
+    residuals : `~astropy.table.QTable`
+        What `~photutils_mgauss.MotionSolution.detector_residuals` gives.
+    chip : str, optional
+        Name of the chip.
+    n_cells : int, optional
+        Cells along the longer side.
+    scale : float, optional
+        Residual [pix] as long as a cell, which the key shows; the default
+        is twice the median of the cells.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        Its Axes; arrows shorter than twice their error are grey.
+
+    Raises
+    ------
+    ValueError
+        If there are no residuals on such a chip.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import astropy.units as u
+    >>> from astropy.table import QTable
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import plotting
+    >>> rng = np.random.default_rng(1)
+    >>> x, y = rng.uniform(0, 1000, (2, 2000)) * u.pix
+    >>> table = QTable({'x_pix': x, 'y_pix': y, 'dx_pix': 1e-5 * (y - x),
+    ...                 'dy_pix': rng.normal(0, 0.01, 2000) * u.pix})
+    >>> table['chip'] = ''  # as detector_residuals() has them
+    >>> ax = plotting.plot_residual_map(table, ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('x [pix]', 'y [pix]')
+    """
+    ax = current_axes(ax)
+    places, mean, error, size = _cells(residuals, chip, n_cells)
+    length = np.hypot(*mean)
+    if scale is None:
+        scale = 2 * np.median(length)
+    clear = length > 2 * error
+    for which, colour in ((~clear, GREY), (clear, BLUE)):
+        arrows = ax.quiver(*places[:, which], *mean[:, which], color=colour,
+                           angles='xy', scale_units='xy', pivot='middle',
+                           scale=scale / size, width=0.004)
+    ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal')
+    ax.update_datalim(np.concatenate([(places - size / 2).T,
+                                      (places + size / 2).T]))
+    ax.autoscale_view()
+    ax.set_title(f'chip {chip}' if chip else '', loc='left')
+    ax.quiverkey(arrows, 0.85, 1.04, scale, f'{scale:.2g} pix', labelpos='W',
+                 color=BLUE)
+    return ax
+
+
+def _cells(residuals, chip, n_cells):
+    """Return places, means (2, c), errors (c,) and the size of the cells."""
+    names = ('x_pix', 'y_pix', 'dx_pix', 'dy_pix')
+    own = residuals[np.ma.filled(residuals['chip'], '') == chip]
+    x, y, dx, dy = (np.asarray(own[name].value) for name in names)
+    good = np.isfinite(x + y + dx + dy)
+    if not good.any():
+        msg = f'residuals must have some on chip {chip!r}, got none'
+        raise ValueError(msg)
+    x, y, dx, dy = (values[good] for values in (x, y, dx, dy))
+    size = max(np.ptp(x), np.ptp(y), 1e-6) / n_cells * 1.0001
+    column, row = ((values - values.min()) // size for values in (x, y))
+    _, cell, count = np.unique(column + n_cells * row, return_inverse=True,
+                               return_counts=True)
+    kept = count >= _ENOUGH
+
+    def mean(values):
+        return (np.bincount(cell, values) / count)[kept]
+
+    scatter = np.hypot(*(np.sqrt(np.maximum(
+        mean(values**2) - mean(values)**2, 0)) for values in (dx, dy)))
+    places = np.stack([values.min() + (mean(index) + 0.5) * size
+                       for values, index in ((x, column), (y, row))])
+    return (places, np.stack([mean(dx), mean(dy)]),
+            scatter / np.sqrt(count[kept] - 1), size)
 
 
 def _field_coordinates(rows):
@@ -90,6 +222,30 @@ def plot_proper_motions(stars, *, membership=None, ax=None):
     -------
     `~matplotlib.axes.Axes`
         Its Axes; reference objects are orange.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import Epoch, ProperMotionFitter, plotting
+    >>> rng = np.random.default_rng(1)
+    >>> place, motion = rng.uniform(0, 900, (2, 60)), rng.normal(0, 1, (2, 60))
+    >>> motion[:, :20] = 0  # quasars
+    >>> epochs = []
+    >>> for year in (2020.0, 2022.0, 2025.0):
+    ...     x, y = (place + motion * (year - 2022)
+    ...             + rng.normal(0, 0.02, (2, 60)))
+    ...     epochs.append(Epoch(Table({
+    ...         'id': np.arange(60), 'x_fit': x, 'y_fit': y,
+    ...         'x_err': np.full(60, 0.02), 'y_err': np.full(60, 0.02)}),
+    ...         time=year))
+    >>> fitter = ProperMotionFitter(references=range(20))
+    >>> solution = fitter.fit(epochs)
+    >>> ax = plotting.plot_proper_motions(solution.stars,
+    ...                                   ax=Figure().add_subplot())
+    >>> [text.get_text() for text in ax.get_legend().get_texts()]
+    ['stars', 'references']
     """
     ax = current_axes(ax)
     reference = _is_reference(stars)
@@ -118,6 +274,63 @@ def _is_reference(stars):
     return np.ma.filled(stars['reference'], '') != ''
 
 
+def plot_reference_differences(table, *, ax=None):
+    """
+    Plot the motions measured of references less those of their catalogue.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        What `~photutils_mgauss.MotionSolution.reference_differences` or
+        ``validation`` gives; rows with NaN are left out.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        Its Axes. If catalogue and errors are right, two thirds of the bars
+        of each direction reach the cross at zero.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import Epoch, ProperMotionFitter, plotting
+    >>> rng = np.random.default_rng(1)
+    >>> place, motion = rng.uniform(0, 900, (2, 60)), rng.normal(0, 1, (2, 60))
+    >>> motion[:, :20] = 0  # quasars
+    >>> epochs = []
+    >>> for year in (2020.0, 2022.0, 2025.0):
+    ...     x, y = (place + motion * (year - 2022)
+    ...             + rng.normal(0, 0.02, (2, 60)))
+    ...     epochs.append(Epoch(Table({
+    ...         'id': np.arange(60), 'x_fit': x, 'y_fit': y,
+    ...         'x_err': np.full(60, 0.02), 'y_err': np.full(60, 0.02)}),
+    ...         time=year))
+    >>> fitter = ProperMotionFitter(references=range(20))
+    >>> solution = fitter.fit(epochs)
+    >>> table = solution.reference_differences()
+    >>> ax = plotting.plot_reference_differences(table,
+    ...                                          ax=Figure().add_subplot())
+    >>> ax.get_title(loc='left')
+    'measured minus catalogue'
+    """
+    ax = current_axes(ax)
+    for draw in (ax.axhline, ax.axvline):
+        draw(0, color=BLACK, linewidth=0.8)
+    names = ('dpmra', 'dpmdec', 'dpmdec_error', 'dpmra_error')
+    ax.errorbar(*(table[name].value for name in names), fmt='.',
+                color=ORANGE, alpha=0.5, elinewidth=0.5, markersize=3)
+    unit = table['dpmra'].unit
+    ax.set(xlabel=rf'$\Delta\mu_{{\alpha*}}$ [{unit}]',
+           ylabel=rf'$\Delta\mu_\delta$ [{unit}]', aspect='equal')
+    ax.set_title('measured minus catalogue', loc='left')
+    ax.invert_xaxis()
+    return ax
+
+
 def plot_motions_by_magnitude(stars, magnitude, *, ax=None):
     """
     Plot both proper motions against magnitude.
@@ -137,6 +350,30 @@ def plot_motions_by_magnitude(stars, magnitude, *, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import Epoch, ProperMotionFitter, plotting
+    >>> rng = np.random.default_rng(1)
+    >>> place, motion = rng.uniform(0, 900, (2, 60)), rng.normal(0, 1, (2, 60))
+    >>> motion[:, :20] = 0  # quasars
+    >>> epochs = []
+    >>> for year in (2020.0, 2022.0, 2025.0):
+    ...     x, y = (place + motion * (year - 2022)
+    ...             + rng.normal(0, 0.02, (2, 60)))
+    ...     epochs.append(Epoch(Table({
+    ...         'id': np.arange(60), 'x_fit': x, 'y_fit': y,
+    ...         'x_err': np.full(60, 0.02), 'y_err': np.full(60, 0.02)}),
+    ...         time=year))
+    >>> fitter = ProperMotionFitter(references=range(20))
+    >>> solution = fitter.fit(epochs)
+    >>> ax = plotting.plot_motions_by_magnitude(
+    ...     solution.stars, rng.uniform(18, 22, 60), ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('magnitude [mag]', 'motion [pix / yr]')
     """
     ax = current_axes(ax)
     for name, colour in (('pmra', ORANGE), ('pmdec', BLUE)):
@@ -168,6 +405,30 @@ def plot_motion_errors(stars, magnitude, *, bound=None, ax=None):
     `~matplotlib.axes.Axes`
         Its Axes. Reference objects, whose errors a catalogue gave, are left
         out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import Epoch, ProperMotionFitter, plotting
+    >>> rng = np.random.default_rng(1)
+    >>> place, motion = rng.uniform(0, 900, (2, 60)), rng.normal(0, 1, (2, 60))
+    >>> motion[:, :20] = 0  # quasars
+    >>> epochs = []
+    >>> for year in (2020.0, 2022.0, 2025.0):
+    ...     x, y = (place + motion * (year - 2022)
+    ...             + rng.normal(0, 0.02, (2, 60)))
+    ...     epochs.append(Epoch(Table({
+    ...         'id': np.arange(60), 'x_fit': x, 'y_fit': y,
+    ...         'x_err': np.full(60, 0.02), 'y_err': np.full(60, 0.02)}),
+    ...         time=year))
+    >>> fitter = ProperMotionFitter(references=range(20))
+    >>> solution = fitter.fit(epochs)
+    >>> ax = plotting.plot_motion_errors(
+    ...     solution.stars, rng.uniform(18, 22, 60), ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('magnitude [mag]', 'error [pix / yr]')
     """
     ax = current_axes(ax)
     free = ~_is_reference(stars)
@@ -200,6 +461,31 @@ def plot_errors_by_epochs(solutions, *, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from astropy.table import Table
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import Epoch, ProperMotionFitter, plotting
+    >>> rng = np.random.default_rng(1)
+    >>> place, motion = rng.uniform(0, 900, (2, 60)), rng.normal(0, 1, (2, 60))
+    >>> motion[:, :20] = 0  # quasars
+    >>> epochs = []
+    >>> for year in (2020.0, 2022.0, 2025.0):
+    ...     x, y = (place + motion * (year - 2022)
+    ...             + rng.normal(0, 0.02, (2, 60)))
+    ...     epochs.append(Epoch(Table({
+    ...         'id': np.arange(60), 'x_fit': x, 'y_fit': y,
+    ...         'x_err': np.full(60, 0.02), 'y_err': np.full(60, 0.02)}),
+    ...         time=year))
+    >>> fitter = ProperMotionFitter(references=range(20))
+    >>> solution = fitter.fit(epochs)
+    >>> solutions = [fitter.fit(epochs[:2]), solution]
+    >>> ax = plotting.plot_errors_by_epochs(solutions,
+    ...                                     ax=Figure().add_subplot())
+    >>> ax.get_xlabel()
+    'number of epochs'
     """
     ax = current_axes(ax)
     counts = [len(solution.epochs) for solution in solutions]
@@ -237,6 +523,25 @@ def plot_cutouts(cutouts, *, ax=None):
     ------
     ValueError
         If the table has no rows.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import (
+    ...     ImageEpoch, Instrument, PixelMotionFitter, paper_exposures,
+    ...     plotting, simulate_epochs, sky_field)
+    >>> sources = sky_field(4, 4, size=0.12, magnitudes=(20, 22),
+    ...                     parallaxes=False, separation=1.0, rng=1)
+    >>> images = [ImageEpoch(one.image, one.psf, one.wcs, one.time,
+    ...                      error=one.error)
+    ...           for one in simulate_epochs(
+    ...               sources, paper_exposures()[::3], rng=2,
+    ...               instrument=Instrument(shape=(200, 200)))]
+    >>> solution = PixelMotionFitter().fit(images, sources['ra', 'dec'])
+    >>> ax = plotting.plot_cutouts(solution.cutouts(),
+    ...                            ax=Figure().add_subplot())
+    >>> len(ax.images)
+    1
     """
     if not len(cutouts):
         msg = 'cutouts must have at least one row, got none'

@@ -35,6 +35,26 @@ def plot_posterior(posterior, name, *, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import (
+    ...     GaussianMixture, MixturePosterior, fit_mixture, plotting)
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0], [0, 2]]])
+    >>> fit = fit_mixture(psf.render((15, 15), 7, 7), 1)
+    >>> noise = 0.01 * np.random.default_rng(1).standard_normal((2, 50, 1))
+    >>> posterior = MixturePosterior(  # as sample_mixture returns it
+    ...     weights=np.ones((2, 50, 1)),
+    ...     means=np.stack([noise, -noise], axis=-1),
+    ...     stddevs=np.sqrt(2) + np.stack([noise, noise], axis=-1),
+    ...     rho=noise, flux=1 + noise[..., 0],
+    ...     sigma=0.1 + 0 * noise[..., 0], fit=fit, idata=None)
+    >>> ax = plotting.plot_posterior(posterior, 'stddevs',
+    ...                              ax=Figure().add_subplot())
+    >>> ax.get_xlabel()
+    'stddevs [pix]'
     """
     chosen = _named_draws(posterior, name)
     ax = current_axes(ax)
@@ -62,6 +82,26 @@ def plot_trace(posterior, name, *, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import (
+    ...     GaussianMixture, MixturePosterior, fit_mixture, plotting)
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0], [0, 2]]])
+    >>> fit = fit_mixture(psf.render((15, 15), 7, 7), 1)
+    >>> noise = 0.01 * np.random.default_rng(1).standard_normal((2, 50, 1))
+    >>> posterior = MixturePosterior(  # as sample_mixture returns it
+    ...     weights=np.ones((2, 50, 1)),
+    ...     means=np.stack([noise, -noise], axis=-1),
+    ...     stddevs=np.sqrt(2) + np.stack([noise, noise], axis=-1),
+    ...     rho=noise, flux=1 + noise[..., 0],
+    ...     sigma=0.1 + 0 * noise[..., 0], fit=fit, idata=None)
+    >>> ax = plotting.plot_trace(posterior, 'stddevs',
+    ...                          ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('draw', 'stddevs [pix]')
     """
     chosen = _named_draws(posterior, name)
     ax = current_axes(ax)
@@ -97,6 +137,25 @@ def plot_corner(posterior, names=None, *, axes=None):
     ------
     ValueError
         If a name is unknown, or ``axes`` has another shape.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import (
+    ...     GaussianMixture, MixturePosterior, fit_mixture, plotting)
+    >>> psf = GaussianMixture([1], [[0, 0]], [[[2, 0], [0, 2]]])
+    >>> fit = fit_mixture(psf.render((15, 15), 7, 7), 1)
+    >>> noise = 0.01 * np.random.default_rng(1).standard_normal((2, 50, 1))
+    >>> posterior = MixturePosterior(  # as sample_mixture returns it
+    ...     weights=np.ones((2, 50, 1)),
+    ...     means=np.stack([noise, -noise], axis=-1),
+    ...     stddevs=np.sqrt(2) + np.stack([noise, noise], axis=-1),
+    ...     rho=noise, flux=1 + noise[..., 0],
+    ...     sigma=0.1 + 0 * noise[..., 0], fit=fit, idata=None)
+    >>> axes = plotting.plot_corner(posterior, ['x_mean_1', 'x_stddev_1'])
+    >>> axes.shape
+    (2, 2)
     """
     names = list(posterior.parameters()) if names is None else list(names)
     draws = {label: np.ravel(values) for name in names
@@ -177,6 +236,14 @@ def plot_model_graph(n_components, shape, *, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import plotting
+    >>> ax = plotting.plot_model_graph(3, (25, 25), ax=Figure().add_subplot())
+    >>> [text.get_text().split()[0] for text in ax.texts if text.get_text()]
+    ['sigma', 'omega', 'alpha', 'beta', 'gamma', 'image']
     """
     ax = current_axes(ax)
     k = n_components

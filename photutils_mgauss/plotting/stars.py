@@ -36,6 +36,17 @@ def plot_detections(x, y, flux, *, data=None, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import plotting
+    >>> rng = np.random.default_rng(1)
+    >>> x, y, flux = rng.uniform(0, 100, (3, 30))
+    >>> ax = plotting.plot_detections(x, y, flux, ax=Figure().add_subplot())
+    >>> ax.get_title()
+    '30 stars'
     """
     ax = current_axes(ax)
     flux = np.maximum(np.nan_to_num(flux), 1e-300)
@@ -77,6 +88,18 @@ def plot_residual_image(residual, error, *, limit=5, ax=None):
     -------
     `~matplotlib.axes.Axes`
         Its Axes, with a colour bar beside them.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import plotting
+    >>> rng = np.random.default_rng(1)
+    >>> residual, error = rng.normal(0, 2, (40, 50)), 2.0
+    >>> ax = plotting.plot_residual_image(residual, error,
+    ...                                   ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('x [pix]', 'y [pix]')
     """
     ax = current_axes(ax)
     shown = ax.imshow(np.asarray(residual) / np.asarray(error),
@@ -107,6 +130,19 @@ def plot_stated_errors(magnitude, errors, *, unit, label=None, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import plotting
+    >>> rng = np.random.default_rng(1)
+    >>> magnitude = rng.uniform(18, 24, 50)
+    >>> errors = {'x_err': 0.002 * 10**(0.2 * (magnitude - 18))}
+    >>> ax = plotting.plot_stated_errors(magnitude, errors, unit='pix',
+    ...                                  ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('magnitude [mag]', 'stated error [pix]')
     """
     ax = current_axes(ax)
     for (name, values), colour in zip(errors.items(), CYCLE, strict=False):
@@ -138,6 +174,20 @@ def plot_error_curve(magnitude, residuals, errors, *, unit, n_bins=6, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import plotting
+    >>> rng = np.random.default_rng(1)
+    >>> magnitude = rng.uniform(18, 24, 500)
+    >>> errors = 0.002 * 10**(0.2 * (magnitude - 18))
+    >>> ax = plotting.plot_error_curve(
+    ...     magnitude, rng.normal(0, errors), errors, unit='pix',
+    ...     ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('magnitude [mag]', 'error [pix]')
     """
     ax = current_axes(ax)
     magnitude = np.asarray(magnitude, float)
@@ -175,6 +225,19 @@ def plot_comparison(true, measured, errors, *, label, unit, ax=None):
     Returns
     -------
     `~matplotlib.axes.Axes`
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import plotting
+    >>> rng = np.random.default_rng(1)
+    >>> true, errors = rng.normal(0, 5, 50), np.full(50, 0.3)
+    >>> ax = plotting.plot_comparison(true, rng.normal(true, errors), errors,
+    ...                               label='pmra', unit='mas / yr',
+    ...                               ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_ylabel()
+    ('true pmra [mas / yr]', 'measured pmra [mas / yr]')
     """
     ax = current_axes(ax)
     ax.errorbar(true, measured, errors, fmt='.', color=BLUE, ecolor=BLUE,

@@ -154,6 +154,11 @@ class MultiGaussianPSFModel(PSFModel):
                                             shape.stddevs, shape.rho)
 
     @property
+    def fwhm(self):
+        """The full width at half maximum of the mixture [pix]."""
+        return self.mixture.fwhm
+
+    @property
     def grid(self):
         """The mixture as a grid of one node, see ``PSFModel``."""
         return Grid.of_mixture(self.mixture)

@@ -4,46 +4,57 @@ Stars photon by photon, where charge pushes later charge away.
 GalSim's model of a silicon sensor moves the edges of pixels with the charge
 they hold, which makes bright stars wider than faint ones.
 """
+from dataclasses import dataclass, field
+
 import numpy as np
+from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.utils.validation import as_real
 
-# Half the side of the stamp that a star's photons fall on [pix].
-_HALF = 24
+# Half the side of the stamp that a star's photons fall on, and of its middle
+# where charge moves [pix]. The time goes with the area of the middle.
+_HALF, _CORE = 24, 8
+
+# Of fainter stars [electron] the effect moves less than 1e-4 of the charge;
+# they are drawn as if there were none.
+FAINT = 2000.0
+
+
+def repelled(x, y, flux, shape):
+    """Return which stars (n,) are drawn photon by photon."""
+    ny, nx = shape
+    return ((flux >= FAINT) & (np.rint(x) >= 0) & (np.rint(x) < nx)
+            & (np.rint(y) >= 0) & (np.rint(y) < ny))
 
 
 def shoot_stars(psf, x, y, flux, response, strength, rng):
     """
     Return the electrons (ny, nx) of stars whose charge repels.
 
-    Each star's photons are a Poisson number, drawn from its mixture; a pixel
+    Each star's photons are a Poisson number, drawn from its PSF; a pixel
     turns the fraction response (ny, nx) of those that fall on it, relative to
     a common pixel, into charge.
     """
-    sensor = _sensor(psf, strength, rng)
+    source = _source(psf)
+    sensor = _sensor(strength, rng)
     response = np.pad(response, _HALF, constant_values=1.0)
     wide = np.zeros(response.shape, np.float32)
-    stamps = [_stamp(a, b, wide.shape) for a, b in zip(x, y, strict=True)]
+    stamps = [_stamp(a, b) for a, b in zip(x, y, strict=True)]
     # So many photons that a pixel of the best response loses none of them.
-    best = np.array([1.0 if stamp is None else response[stamp].max()
-                     for stamp in stamps])
-    numbers = rng.poisson(np.maximum(flux, 0) * best)
+    best = np.array([response[stamp].max() for stamp in stamps])
+    numbers = rng.poisson(flux * best)
     for a, b, stamp, number in zip(x, y, stamps, numbers, strict=True):
-        if stamp is None:
-            continue
         middle = np.array([[a - round(a)], [b - round(b)]])
-        places = middle + photons(psf.mixture_at(a, b), number, rng)
+        places = middle + source(a, b, number, rng)
         places = _converted(places, response[stamp], rng)
         wide[stamp] = _accumulate(sensor, places, wide[stamp])
     return wide[_HALF:-_HALF, _HALF:-_HALF]
 
 
-def _stamp(x, y, shape):
-    """Return the pixels of a star on the wide image; None if it is off it."""
+def _stamp(x, y):
+    """Return the pixels of a star on the wide image."""
     i, j = round(x), round(y)
-    if not (0 <= i < shape[1] - 2 * _HALF and 0 <= j < shape[0] - 2 * _HALF):
-        return None
     return np.s_[j:j + 2 * _HALF + 1, i:i + 2 * _HALF + 1]
 
 
@@ -66,11 +77,70 @@ def photons(mixture, number, rng):
             + np.einsum('nij,nj->ni', lower[which], steps)).T
 
 
-def _sensor(psf, strength, rng):
-    if not isinstance(psf, GriddedMixturePSF) or not psf.pixel_integrated:
-        msg = ('psf must be a GriddedMixturePSF with pixel_integrated=True '
-               f'for the brighter-fatter effect, got {psf!r:.80}')
-        raise ValueError(msg)
+@dataclass(frozen=True, eq=False)
+class OpticsPhotons:
+    """
+    Photons of stars whose PSF a telescope's optics made.
+
+    Between the nodes of the table they are those of its four neighbours,
+    with the weights of the table's own blend.
+    """
+
+    psf: GriddedPSFModel
+    oversampling: int = 4
+    _nodes: dict = field(default_factory=dict, init=False)
+
+    def __call__(self, x, y, number, rng):
+        """Draw places (2, number) relative to a star at x, y [pix]."""
+        nodes, weights = self._neighbours(x, y)
+        shares = rng.multinomial(number, weights)
+        return np.concatenate([self._at_node(node, n, rng) for node, n in
+                               zip(nodes, shares, strict=True)], axis=1)
+
+    def _neighbours(self, x, y):
+        """Return the four nodes around a place and their weights."""
+        axes = [np.unique(axis) for axis in np.transpose(self.psf.grid_xypos)]
+        cells = []
+        for axis, value in zip(axes, (x, y), strict=True):
+            low = int(np.clip(np.searchsorted(axis, value) - 1, 0,
+                              axis.size - 2))
+            share = np.clip((value - axis[low])
+                            / (axis[low + 1] - axis[low]), 0, 1)
+            cells.append(((axis[low], 1 - share), (axis[low + 1], share)))
+        return ([(float(a), float(b)) for b, _ in cells[1]
+                 for a, _ in cells[0]],
+                [v * u for _, v in cells[1] for _, u in cells[0]])
+
+    def _at_node(self, node, number, rng):
+        """Draw places (2, number) from the light at a node."""
+        if node not in self._nodes:
+            light = self.psf.meta['optics'].light(
+                *node, oversampling=self.oversampling, radius=_HALF)
+            total = np.cumsum(np.maximum(light, 0))
+            self._nodes[node] = total / total[-1]
+        chosen = np.searchsorted(self._nodes[node], rng.random(number),
+                                 side='right')
+        side = 2 * _HALF * self.oversampling + 1
+        row, column = np.divmod(chosen, side)
+        place = np.stack([column, row]) - (side - 1) / 2
+        place += rng.uniform(-0.5, 0.5, place.shape)
+        return place / self.oversampling
+
+
+def _source(psf):
+    """Return what draws photons: from x, y, number, rng to places."""
+    if isinstance(psf, GriddedMixturePSF) and psf.pixel_integrated:
+        return lambda x, y, number, rng: photons(psf.mixture_at(x, y),
+                                                 number, rng)
+    if isinstance(psf, GriddedPSFModel) and 'optics' in psf.meta:
+        return OpticsPhotons(psf)
+    msg = ('psf must be a GriddedMixturePSF with pixel_integrated=True, or '
+           'made by Optics.to_gridded_psf, for the brighter-fatter effect, '
+           f'got {psf!r:.80}')
+    raise ValueError(msg)
+
+
+def _sensor(strength, rng):
     try:
         import galsim
     except ImportError as error:
@@ -85,8 +155,17 @@ def _sensor(psf, strength, rng):
 def _accumulate(sensor, places, stamp):
     """Return the stamp with photons, relative to its middle, added."""
     import galsim
-    image = galsim.ImageF(stamp.copy(), xmin=-_HALF, ymin=-_HALF)
-    x, y = (np.ascontiguousarray(axis) for axis in places)
-    array = galsim.PhotonArray(x.size, x=x, y=y, flux=np.ones(x.size))
-    sensor.accumulate(array, image)
-    return image.array
+    stamp = stamp.copy()
+    inner = (np.abs(places) < _CORE + 0.5).all(axis=0)
+    column, row = np.rint(places[:, ~inner]).astype(int) + _HALF
+    on = (np.minimum(row, column) >= 0) & (np.maximum(row, column)
+                                           <= 2 * _HALF)
+    np.add.at(stamp, (row[on], column[on]), 1)
+    middle = slice(_HALF - _CORE, _HALF + _CORE + 1)
+    image = galsim.ImageF(stamp[middle, middle].copy(), xmin=-_CORE,
+                          ymin=-_CORE)
+    x, y = (np.ascontiguousarray(axis) for axis in places[:, inner])
+    sensor.accumulate(galsim.PhotonArray(x.size, x=x, y=y,
+                                         flux=np.ones(x.size)), image)
+    stamp[middle, middle] = image.array
+    return stamp

@@ -1,19 +1,25 @@
 """
 What a detector does to an image beyond noise (Nie et al., Sec. 2.1.2).
 
-What belongs to the detector (response, hot, dead and bad pixels) is drawn
-from its number, and is the same in all its exposures; cosmic rays are drawn
-with the noise.
+What belongs to the detector (response, flat field, hot, warm, dead and bad
+pixels) is drawn from its number, and is the same in all its exposures; cosmic
+rays are drawn with the noise.
 """
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import legendre
 
 from photutils_mgauss import kernels
 from photutils_mgauss.utils.validation import as_integer, as_real
 
 # Bits of the flags of a pixel.
-SATURATED, COSMIC_RAY, HOT, DEAD, BAD_COLUMN = 1, 2, 4, 8, 16
+SATURATED, COSMIC_RAY, HOT, DEAD, BAD_COLUMN, WARM = 1, 2, 4, 8, 16, 32
+
+# Which products of Legendre polynomials the large-scale flat has: all that
+# vary, up to the fourth order.
+_LARGE_SCALE = ((np.add(*np.indices((5, 5))) <= 4)
+                & (np.add(*np.indices((5, 5))) >= 1))
 
 # What a dead pixel and a bad column respond with.
 _DEAD_RESPONSE = 0.05
@@ -35,16 +41,18 @@ class DetectorEffects:
     ----------
     prnu : float, optional
         Standard deviation of the response of pixels. The image is divided
-        by the true response, so that only the noise feels it.
+        by the response that the flat field shows, so that only the noise
+        and ``flat_error`` are left of it.
     hot_pixels, dead_pixels : float, optional
-        The fractions of such pixels.
+        The fractions of such pixels. They are flagged.
     hot_dark : float, optional
         Mean dark current of hot pixels, exponentially distributed
         [electron / s].
     bad_columns : int, optional
-        The number of columns that lose most of their light.
+        The number of columns that lose most of their light. They are
+        flagged.
     cosmic_rays : float, optional
-        Particles per million pixels and second.
+        Particles per million pixels and second. Their pixels are flagged.
     nonlinearity : float, optional
         The relative loss at the full well, growing linearly with the charge.
         It is left in the image.
@@ -55,22 +63,47 @@ class DetectorEffects:
         which widens the PSF.
     brighter_fatter : float, optional
         The strength of the repulsion of charge, 1 for a common CCD. It needs
-        galsim and a PSF of mixtures that are integrated over pixels, and
-        draws every photon; only stars with their centre on the image are
-        drawn.
+        galsim and a PSF of mixtures that are integrated over pixels or one
+        that ``Optics.to_gridded_psf`` made, and draws every photon of the
+        stars on the image that have 2000 electrons or more. Of fainter
+        ones it would move less than 1e-4 of the charge.
+    large_scale_flat : float, optional
+        Standard deviation over the detector of the smooth part of the
+        response, a polynomial of the fourth degree in x and y: vignetting,
+        filter and coating. The image is divided by it.
+    flat_error : float, optional
+        Standard deviation of the error of the flat field that images are
+        divided by, pixel by pixel: the photon noise of the frames that it
+        was made of. It is left in the image, the same in all exposures.
+    shutter : float, optional
+        How long the shutter takes to cross the detector [s]. It opens from
+        the first row to the last and closes on its way back, so that the
+        first row is exposed twice this time longer than the last and the
+        mean of all rows is the nominal time. Images are divided by the
+        exposure of each row; the noise keeps it.
+    warm_pixels : float, optional
+        The fraction of pixels with a raised dark current. They are flagged.
+    warm_dark : float, optional
+        Their mean dark current above that of others, exponentially
+        distributed [electron / s].
 
     Raises
     ------
     ValueError
         If a value is negative or a fraction above 1.
 
+    Notes
+    -----
+    Sizes are chosen: the paper names the effects and does not give their
+    numbers. Those of `typical` are common for CCDs in space.
+
     Examples
     --------
     >>> from photutils_mgauss.simulation import DetectorEffects
     >>> DetectorEffects(cosmic_rays=1.5, bleeding=True).prnu
     0.0
-    >>> DetectorEffects.typical().bleeding
-    True
+    >>> DetectorEffects.typical().prnu
+    0.01
     """
 
     prnu: float = 0.0
@@ -83,14 +116,23 @@ class DetectorEffects:
     bleeding: bool = False
     charge_diffusion: float = 0.0
     brighter_fatter: float = 0.0
+    large_scale_flat: float = 0.0
+    flat_error: float = 0.0
+    shutter: float = 0.0
+    warm_pixels: float = 0.0
+    warm_dark: float = 0.3
 
     def __post_init__(self):
-        for name in ('prnu', 'hot_pixels', 'dead_pixels', 'nonlinearity'):
+        for name in ('prnu', 'hot_pixels', 'dead_pixels', 'nonlinearity',
+                     'large_scale_flat', 'flat_error', 'warm_pixels'):
             as_real(getattr(self, name), name, minimum=0, maximum=1)
         for name in ('hot_dark', 'cosmic_rays', 'charge_diffusion',
-                     'brighter_fatter'):
+                     'brighter_fatter', 'shutter', 'warm_dark'):
             as_real(getattr(self, name), name, minimum=0)
         as_integer(self.bad_columns, 'bad_columns', minimum=0)
+        bad = self.hot_pixels + self.warm_pixels + self.dead_pixels
+        as_real(bad, 'hot_pixels, warm_pixels and dead_pixels together',
+                maximum=1)
 
     @classmethod
     def typical(cls):
@@ -105,7 +147,9 @@ class DetectorEffects:
         """
         return cls(prnu=0.01, hot_pixels=2e-5, dead_pixels=1e-5,
                    bad_columns=1, cosmic_rays=1.5, nonlinearity=0.005,
-                   bleeding=True, charge_diffusion=0.2)
+                   bleeding=True, charge_diffusion=0.2,
+                   large_scale_flat=0.02, flat_error=0.002, shutter=1.0,
+                   warm_pixels=2e-4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +157,7 @@ class Pattern:
     """
     What is fixed about a band of rows of a detector.
 
-    ``flat`` is the response that is known, ``response`` the whole one,
+    ``flat`` is the response that is known, ``response`` the true one,
     ``dark`` the current in excess [electron / s]; all (rows, nx) or numbers.
     """
 
@@ -128,17 +172,61 @@ def pattern(effects, detector, band, width):
     shape = band.stop - band.start, width
     rng = np.random.default_rng([int(detector), int(band.start)])
     flat = _flat(effects.prnu, shape, rng)
-    flags = np.zeros(shape, np.uint8)
-    kind = rng.random(shape) if effects.hot_pixels + effects.dead_pixels else 1
-    flags[kind < effects.hot_pixels] |= HOT
-    flags[1 - kind < effects.dead_pixels] |= DEAD
+    flags = _bad_pixels(effects, shape, rng)
     flags[:, _columns(effects, detector, width)] |= BAD_COLUMN
     dark = np.zeros(shape)
-    hot = (flags & HOT) != 0
-    dark[hot] = effects.hot_dark * rng.standard_exponential(hot.sum())
+    for bit, mean in ((HOT, effects.hot_dark), (WARM, effects.warm_dark)):
+        here = (flags & bit) != 0
+        dark[here] = mean * rng.standard_exponential(here.sum())
     factor = np.where(flags & DEAD, _DEAD_RESPONSE, 1)
     factor = np.where(flags & BAD_COLUMN, _COLUMN_RESPONSE, factor)
-    return Pattern(flat, flat * factor, dark, flags)
+    # After all other numbers: those of a seed stay what they are without it.
+    known = flat * _flat(effects.flat_error, shape, rng)
+    return Pattern(known, flat * factor, dark, flags)
+
+
+def _bad_pixels(effects, shape, rng):
+    """Return the flags (rows, nx) of hot, warm and dead pixels."""
+    flags = np.zeros(shape, np.uint8)
+    hot, warm, dead = (effects.hot_pixels, effects.warm_pixels,
+                       effects.dead_pixels)
+    if hot + warm + dead == 0:
+        return flags
+    kind = rng.random(shape)
+    flags[kind < hot] |= HOT
+    flags[(kind >= hot) & (kind < hot + warm)] |= WARM
+    flags[1 - kind < dead] |= DEAD
+    return flags
+
+
+def illumination(effects, detector, instrument, band):
+    """
+    Return the light (rows, nx) that a band of rows collects.
+
+    It is relative to that of an even response during the nominal exposure:
+    what is smooth in the flat field times the exposure that the shutter
+    gives each row.
+    """
+    ny, nx = instrument.shape
+    v, u = (2 * (np.arange(n) + 0.5) / n - 1 for n in (ny, nx))
+    v = v[band]
+    late = effects.shutter * v / instrument.exposure_time
+    light = np.repeat(1 - late[:, None], nx, axis=1)
+    if effects.large_scale_flat:
+        light *= 1 + effects.large_scale_flat * legendre.leggrid2d(
+            v, u, _large_scale(detector))
+    return np.maximum(light, 0.1)
+
+
+def _large_scale(detector):
+    """Return coefficients (5, 5) of a smooth field of variance 1."""
+    rng = np.random.default_rng([int(detector), 0, 0])
+    i, j = np.indices((5, 5))
+    coefficients = np.where(
+        _LARGE_SCALE, rng.standard_normal((5, 5)) / (1.0 + i + j), 0)
+    # The mean square of a Legendre polynomial of degree i is 1 / (2 i + 1).
+    variance = (coefficients**2 / ((2 * i + 1) * (2 * j + 1))).sum()
+    return coefficients / np.sqrt(variance)
 
 
 def _flat(prnu, shape, rng):

@@ -3,7 +3,7 @@ The camera of a simulated image: its numbers, and its bands.
 
 The defaults are Table 1 of Nie et al. and the CSST survey camera.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -40,11 +40,17 @@ class Band:
         The surface brightness of the sky [mag / arcsec^2].
     diameter : float, optional
         That of the unobstructed pupil [m].
+    response : (n,) tuple of float, optional
+        The relative efficiency at wavelengths that divide the band evenly,
+        from the blue limit to the red: how much each wavelength counts in
+        the PSF of `Optics`. By default all count alike. The zeropoint does
+        not depend on it.
 
     Raises
     ------
     ValueError
-        If the wavelengths do not ascend or a value is not positive.
+        If the wavelengths do not ascend, a value is not positive, or the
+        response is negative everywhere or somewhere.
 
     Examples
     --------
@@ -59,7 +65,7 @@ class Band:
 
     >>> from photutils_mgauss import CSST_BANDS
     >>> list(CSST_BANDS), CSST_BANDS['i'].wavelengths
-    (['g', 'r', 'i'], (684.0, 842.0))
+    (['NUV', 'u', 'g', 'r', 'i', 'z', 'y'], (684.0, 842.0))
     """
 
     name: str
@@ -67,6 +73,7 @@ class Band:
     efficiency: float
     sky: float
     diameter: float = 2.0
+    response: tuple = field(default=(1.0, 1.0), kw_only=True)
 
     def __post_init__(self):
         blue, red = as_floats(self.wavelengths, 'wavelengths', shape=(2,))
@@ -77,6 +84,39 @@ class Band:
         as_real(self.efficiency, 'efficiency', above=0, maximum=1)
         as_real(self.sky, 'sky')
         as_real(self.diameter, 'diameter', above=0)
+        response = as_floats(self.response, 'response', shape=(None,))
+        if response.size < 2 or response.min() < 0 or response.max() <= 0:
+            msg = ('response must have two or more values, none negative and '
+                   f'not all zero, got {self.response}')
+            raise ValueError(msg)
+
+    def colours(self, n):
+        """
+        Return wavelengths that stand for the band, and how much each counts.
+
+        Parameters
+        ----------
+        n : int
+            Their number: the middles of as many equal parts of the band.
+
+        Returns
+        -------
+        (2, n) `~numpy.ndarray`
+            Wavelengths [nm] and weights that sum to 1.
+
+        Examples
+        --------
+        >>> from photutils_mgauss.simulation import Band
+        >>> band = Band('g', (400, 500), 0.4, 22.6, response=(1, 3))
+        >>> band.colours(2).tolist()
+        [[425.0, 475.0], [0.375, 0.625]]
+        """
+        blue, red = self.wavelengths
+        middles = (np.arange(n) + 0.5) / n
+        knots = np.linspace(0, 1, len(self.response))
+        weights = np.interp(middles, knots, self.response)
+        return np.stack([blue + (red - blue) * middles,
+                         weights / weights.sum()])
 
     @property
     def zeropoint(self):
@@ -125,13 +165,20 @@ class Band:
 
 # The efficiencies are means over each band of the telescope and the detector,
 # chosen so that two exposures of Table 1 reach the survey's depths at a
-# signal to noise of 5: 26.3 (g), 26.0 (r) and 25.9 mag (i). The sky is the
-# zodiacal light away from the ecliptic with some earthshine.
+# signal to noise of 5: 25.4 (NUV), 25.4 (u), 26.3 (g), 26.0 (r), 25.9 (i),
+# 25.2 (z) and 24.4 mag (y). The sky is the zodiacal light away from the
+# ecliptic with some earthshine. Responses are chosen, too: a silicon detector
+# that gains towards the red in the blue bands and loses beyond 800 nm.
 CSST_BANDS = {
-    band.name: band for band in (
-        Band('g', (401.0, 547.0), 0.37, 22.6),
-        Band('r', (547.0, 684.0), 0.41, 22.2),
-        Band('i', (684.0, 842.0), 0.43, 22.0),
+    name: Band(name, wavelengths, efficiency, sky, response=response)
+    for name, wavelengths, efficiency, sky, response in (
+        ('NUV', (255.0, 317.0), 0.18, 25.0, (0.60, 0.80, 0.90, 1.00, 1.00)),
+        ('u', (322.0, 396.0), 0.20, 23.3, (0.75, 0.85, 0.92, 0.97, 1.00)),
+        ('g', (401.0, 547.0), 0.37, 22.6, (0.85, 0.93, 0.98, 1.00, 1.00)),
+        ('r', (547.0, 684.0), 0.41, 22.2, (1.00, 1.00, 1.00, 0.99, 0.97)),
+        ('i', (684.0, 842.0), 0.43, 22.0, (1.00, 0.98, 0.95, 0.90, 0.84)),
+        ('z', (842.0, 1000.0), 0.26, 21.9, (1.00, 0.88, 0.70, 0.48, 0.25)),
+        ('y', (937.0, 1000.0), 0.31, 21.8, (1.00, 0.87, 0.70, 0.52, 0.36)),
     )}
 
 

@@ -2,8 +2,9 @@
 A PSF field from the optics of a telescope, through GalSim where installed.
 
 The star is imaged by a clear circular pupil, at several wavelengths of the
-band, with aberrations that are cubic polynomials of the position; the jitter
-of the telescope and the diffusion of charge in the detector widen it.
+band that count as its response says, with aberrations that are cubic
+polynomials of the position; the jitter of the telescope and the diffusion of
+charge in the detector widen it.
 """
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -22,7 +23,7 @@ from photutils_mgauss.utils.validation import (
     as_shape,
 )
 
-__doctest_requires__ = {'Optics': ['galsim']}
+__doctest_requires__ = {'Optics*': ['galsim']}
 
 # Noll's numbers of the aberrations: defocus, astigmatism, coma, trefoil and
 # spherical, and how strong each is in comparison.
@@ -139,21 +140,23 @@ class Optics:
         ``galsim.GSObject``
             Of unit flux, in arcseconds.
         """
+        return self._profile(x, y, self.jitter**2 + self.diffusion**2)
+
+    def _profile(self, x, y, variance):
+        """Return the star, widened by a Gaussian of a variance."""
         galsim = _galsim()
         params = galsim.GSParams(maximum_fft_size=8192,
                                  folding_threshold=2.5e-3)
         error = self.aberrations(x, y)
-        blue, red = self.band.wavelengths
-        middles = (np.arange(self.n_wavelengths) + 0.5) / self.n_wavelengths
-        colours = [galsim.OpticalPSF(
+        colours = [weight * galsim.OpticalPSF(
             lam=wavelength, diam=self.band.diameter,
             aberrations=list(error / wavelength), oversampling=1.5,
             pad_factor=1.5, gsparams=params)
-            for wavelength in blue + (red - blue) * middles]
-        light = galsim.Sum(colours) / len(colours)
-        width = float(np.hypot(self.jitter, self.diffusion))
-        return galsim.Convolve([light, galsim.Gaussian(sigma=width)],
-                               gsparams=params)
+            for wavelength, weight in
+            self.band.colours(self.n_wavelengths).T]
+        light = galsim.Sum(colours)
+        blur = galsim.Gaussian(sigma=float(np.sqrt(variance)))
+        return galsim.Convolve([light, blur], gsparams=params)
 
     def to_gridded_psf(self, n_nodes=21, *, n_samples=10, oversampling=4,
                        radius=32):
@@ -179,7 +182,8 @@ class Optics:
         Returns
         -------
         `~photutils.psf.GriddedPSFModel`
-            To be given to `simulate`.
+            To be given to `simulate`. Its ``meta['optics']`` is this object,
+            from which the brighter-fatter effect draws photons.
 
         Raises
         ------
@@ -204,7 +208,45 @@ class Optics:
             images.reshape(-1, *images.shape[2:]), meta={
                 'grid_xypos': [self._place(u, v) for v in nodes
                                for u in nodes],
-                'oversampling': oversampling}))
+                'oversampling': oversampling, 'optics': self}))
+
+    def light(self, x, y, *, oversampling=4, radius=24):
+        """
+        Draw the star at a place as photons fall on the detector.
+
+        The image is narrower than the star by the width of a sample:
+        photons that are spread evenly over their sample are as wide as the
+        star.
+
+        Parameters
+        ----------
+        x, y : float
+            The place [pix].
+        oversampling : int, optional
+            Samples per pixel.
+        radius : int, optional
+            Half the side of the stamp [pix].
+
+        Returns
+        -------
+        (n, n) `~numpy.ndarray`
+            The share of photons in each sample, before any pixel; it sums
+            to nearly 1.
+
+        Examples
+        --------
+        >>> from photutils_mgauss import Optics
+        >>> optics = Optics((200, 200), 'g', n_wavelengths=1)
+        >>> optics.light(50, 50, radius=8).shape
+        (65, 65)
+        """
+        n = 2 * radius * oversampling + 1
+        side = self.pixel_scale / oversampling
+        variance = self.jitter**2 + self.diffusion**2
+        narrower = max(variance - side**2 / 12, variance / 100)
+        image = self._profile(x, y, narrower).drawImage(
+            nx=n, ny=n, scale=side, method='no_pixel', dtype=float)
+        return image.array
 
     def _place(self, u, v):
         """Return x and y [pix] of coordinates that run from -1 to 1."""

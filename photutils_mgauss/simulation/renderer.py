@@ -3,7 +3,7 @@ What draws stars: mixtures on a grid, or images of effective PSFs on one.
 
 The renderer of images does what `psf.renderer.MixtureRenderer` does.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -100,5 +100,9 @@ def widen(psf, stddev):
     sigma = stddev * np.broadcast_to(psf.oversampling, 2)
     images = [gaussian_filter(np.asarray(image, float), sigma,
                               mode='constant') for image in psf.data]
-    return GriddedPSFModel(NDData(np.array(images), meta={
-        'grid_xypos': psf.grid_xypos, 'oversampling': psf.oversampling}))
+    meta = {'grid_xypos': psf.grid_xypos, 'oversampling': psf.oversampling}
+    if 'optics' in psf.meta:
+        optics = psf.meta['optics']
+        meta['optics'] = replace(optics, diffusion=float(np.hypot(
+            optics.diffusion, stddev * optics.pixel_scale)))
+    return GriddedPSFModel(NDData(np.array(images), meta=meta))

@@ -57,7 +57,7 @@ class Scene:
         itself [electron].
     flags : (ny, nx) `~numpy.ndarray`
         What is wrong with a pixel, as bits: 1 saturated, 2 cosmic ray, 4
-        hot, 8 dead, 16 bad column.
+        hot, 8 dead, 16 bad column, 32 warm.
     truth : `~astropy.table.QTable`
         The sources on the image and close to it: ``id``, ``x``, ``y``
         [pix], ``flux`` in electrons, numbers like the image, ``mag``,
@@ -78,8 +78,8 @@ class Scene:
     >>> from photutils_mgauss import Instrument, simulate, sparse_field
     >>> scene = simulate(sparse_field((150, 200), rng=1), rng=2,
     ...                  instrument=Instrument(shape=(150, 200)))
-    >>> scene.image.shape == scene.error.shape == scene.mask.shape
-    True
+    >>> scene.image.shape, scene.error.shape, scene.mask.shape
+    ((150, 200), (150, 200), (150, 200))
     >>> data = scene.image - scene.background
     >>> stars = scene.truth[scene.truth['inside']]
     >>> stars['x', 'y', 'flux', 'mag'].colnames
@@ -192,7 +192,8 @@ def simulate(sources, exposure=None, *, instrument=None, psf=None,
     Raises
     ------
     ValueError
-        If a column is missing or not finite.
+        If a column is missing or not finite, or the shutter takes longer to
+        cross the detector than half the exposure.
 
     Examples
     --------
@@ -212,6 +213,8 @@ def simulate(sources, exposure=None, *, instrument=None, psf=None,
         psf, = _each_psf(None, [exposure], instrument)
     effects = (DetectorEffects() if effects is None
                else as_instance(effects, DetectorEffects, 'effects'))
+    as_real(effects.shutter, 'the shutter of effects',
+            maximum=instrument.exposure_time / 2)
     psf = widen(psf, effects.charge_diffusion)
     wcs = exposure.wcs(instrument.shape, instrument.pixel_scale)
     truth = _truth(sources, exposure, instrument, wcs)

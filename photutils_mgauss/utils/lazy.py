@@ -5,7 +5,7 @@ from importlib.abc import MetaPathFinder
 from importlib.util import find_spec
 
 
-def hand_on(package, owners):
+def hand_on(package, owners, modules=()):
     """
     Return `__getattr__`, `__dir__` and `__all__` of a package.
 
@@ -15,6 +15,8 @@ def hand_on(package, owners):
         Its ``__name__``.
     owners : dict
         Public name -> the module below the package that owns it.
+    modules : sequence of str, optional
+        Modules below the package that are loaded in the same way.
 
     Returns
     -------
@@ -24,6 +26,8 @@ def hand_on(package, owners):
         Its ``__all__``.
     """
     def load(name):
+        if name in modules:
+            return import_module(f'{package}.{name}')
         if name not in owners:
             msg = f'module {package!r} has no attribute {name!r}'
             raise AttributeError(msg)
@@ -32,7 +36,7 @@ def hand_on(package, owners):
         return value
 
     def listing():
-        return sorted({*vars(import_module(package)), *owners})
+        return sorted({*vars(import_module(package)), *owners, *modules})
 
     return load, listing, list(owners)
 

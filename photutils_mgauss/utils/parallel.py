@@ -11,18 +11,30 @@ from contextvars import ContextVar, copy_context
 from functools import partial
 from itertools import chain
 from queue import Empty, SimpleQueue
-from threading import Thread, current_thread, main_thread
+from threading import Lock, Thread, current_thread, main_thread
+
+from threadpoolctl import threadpool_limits
 
 # Who wants to know how many pieces are done; see `watched`.
 _WATCHER = ContextVar('watcher', default=None)
 
 
+# The cores of which this process takes no more, by order of who started it.
+_LIMIT = {}
+
+
 def available_cores():
     """Return the number of cores this process may use."""
     try:
-        return len(os.sched_getaffinity(0))
+        cores = len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux
-        return os.cpu_count() or 1
+        cores = os.cpu_count() or 1
+    return min(cores, _LIMIT.get('cores', cores))
+
+
+def limit_cores(number):
+    """Have this process use no more cores, because others work beside it."""
+    _LIMIT['cores'] = number
 
 
 class Threads(Executor):
@@ -83,6 +95,36 @@ class Threads(Executor):
 
     def __exit__(self, kind, error, trace):
         self.shutdown(wait=kind is None, cancel_futures=kind is not None)
+
+
+class _SingleBlas:
+    """
+    While somebody is inside, linear algebra starts no threads of its own.
+
+    They would wait for each other in loops, on cores that our threads need.
+    The limit is one of the whole process: who comes first sets it, who leaves
+    last lifts it.
+    """
+
+    def __init__(self):
+        self._lock = Lock()
+        self._inside = 0
+        self._limits = None
+
+    def __enter__(self):
+        with self._lock:
+            if self._inside == 0:
+                self._limits = threadpool_limits(1, user_api='blas')
+            self._inside += 1
+
+    def __exit__(self, kind, error, trace):
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._limits.restore_original_limits()
+
+
+_SINGLE_BLAS = _SingleBlas()
 
 
 def _fulfil(future, call):
@@ -158,7 +200,7 @@ def map_parallel(function, *columns, executor=None, long=False):
     if n_threads < 2 and not waits:
         yield from _told(map(function, *columns), n)
         return
-    with Threads(n_threads) as pool:
+    with _SINGLE_BLAS, Threads(n_threads) as pool:
         yield from _told(pool.map(function, *columns), n)
 
 

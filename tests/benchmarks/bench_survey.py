@@ -1,35 +1,58 @@
 """
 Exposures a minute of ``mgauss survey``, and what the machinery costs.
 
-Simulates exposures of several fields, runs the survey with one process and
-with two, and prints exposures a minute, the efficiency of two processes,
-whether the results are the same to the bit, what an empty task costs, and the
-largest memory of the driver.
+Parts, with ``--parts``, all by default:
 
-Run: ``python tests/benchmarks/bench_survey.py [--fields 4] [--epochs 2]``
+``speed``   the survey of simulated exposures, each a process of its own, by
+            one worker on one core and by two on two: exposures a minute, the
+            efficiency of two, the processor's time of workers and driver,
+            bytes written, and whether the results are the same to the bit.
+``task``    what a task costs that does nothing.
+``memory``  the largest memory of a driver of tiny exposures, for some and for
+            twice as many.
+``kills``   workers (20) and drivers (5) killed at random while tiny exposures
+            are measured: what is lost, and what is done twice.
+
+Run: ``python tests/benchmarks/bench_survey.py [--fields 8] [--epochs 2]``;
+``--fields 40 --epochs 5`` for 200 exposures.
 """
 import argparse
+import json
+import os
 import resource
+import signal
+import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+import astropy.units as u
 import numpy as np
+from astropy.io import fits
 from astropy.table import QTable
+from astropy.wcs import WCS
 
 from photutils_mgauss import (
+    GaussianMixture,
+    GriddedMixturePSF,
     Instrument,
     paper_exposures,
     simulate_epochs,
     sky_field,
 )
-from photutils_mgauss.cli import main
-from photutils_mgauss.cli.survey_run import Task, local_workers, run_tasks
+from photutils_mgauss.cli import main, survey_run
+from photutils_mgauss.cli.survey_plan import read_survey
+from photutils_mgauss.cli.survey_tasks import exposure_tasks
 
+PARTS = ('speed', 'task', 'memory', 'kills')
+TABLES = ('catalogues', 'motions', 'motions_hats/dataset', 'wcs')
+
+
+# Images.
 
 def write_images(folder, n_fields, n_epochs, size):
-    """Write the exposures of fields that lie apart."""
+    """Write the exposures of fields that lie apart, and their quasars."""
     for k in range(n_fields):
         ra, dec = 192.8595, 27.0 + 0.1 * k
         sources = sky_field(120, 60, ra=ra, dec=dec, size=size * 0.074 / 60,
@@ -41,73 +64,261 @@ def write_images(folder, n_fields, n_epochs, size):
                                  instrument=Instrument(shape=(size, size)),
                                  rng=k)
         for number, scene in enumerate(scenes):
-            scene.write(folder / f'field{k}_{number}.fits')
+            scene.write(folder / f'field{k:02d}_{number}.fits')
 
 
-def run_survey(folder, name, workers, pattern='*'):
-    """Run the survey into a folder of its own; return its seconds."""
+def write_tiny(folder, n, size=64, stars=9):
+    """Write tiny exposures, two of each field, and their PSF."""
+    mixture = GaussianMixture([1.0], [[0, 0]], [np.eye(2)])
+    psf = GriddedMixturePSF([mixture], [[0, 0]])
+    psf.write(folder / 'psf.fits')
+    (folder / 'raw').mkdir()
+    rng = np.random.default_rng(1)
+    x, y = np.meshgrid(np.linspace(12, size - 12, 3),
+                       np.linspace(12, size - 12, 3))
+    model = np.full((size, size), 100.0)
+    yy, xx = np.mgrid[:size, :size]
+    for x0, y0 in zip(x.ravel()[:stars], y.ravel(), strict=False):
+        model += 2e4 * mixture.evaluate(xx - x0, yy - y0)
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = 'RA---TAN', 'DEC--TAN'
+    wcs.wcs.cdelt, wcs.wcs.crpix = (-2e-5, 2e-5), (size / 2, size / 2)
+    for k in range(n):
+        wcs.wcs.crval = 10.0 + 0.01 * (k // 2), 20.0
+        header = wcs.to_header()
+        header.update({'BUNIT': 'electron',
+                       'DATE-AVG': f'20{27 + k % 2}-03-01T00:00:00'})
+        fits.writeto(folder / 'raw' / f'e{k:04d}.fits',
+                     rng.poisson(model).astype('f4'), header)
+
+
+# Runs.
+
+def survey_file(folder, name, text=''):
+    """Write a survey file; return its name."""
     path = folder / f'{name}.toml'
     path.write_text(f'output = "{name}"\n[exposures]\n'
-                    f'files = ["raw/{pattern}.fits"]\n')
+                    f'files = ["raw/*.fits"]\n{text}')
+    return path
+
+
+def run_survey(path, workers, cores):
+    """Run a survey in a process of its own; return what it took."""
+    cpus = sorted(os.sched_getaffinity(0))[:cores]
+    result = subprocess.run(
+        [sys.executable, __file__, '--drive', str(path), str(workers)],
+        check=False, capture_output=True, text=True,
+        preexec_fn=lambda: os.sched_setaffinity(0, cpus))
+    if result.returncode:
+        sys.exit(f'the survey {path} failed: {result.stdout[-1000:]}'
+                 f'{result.stderr[-2000:]}')
+    return json.loads(result.stdout.splitlines()[-1])
+
+
+def drive(path, workers):
+    """Run a survey here, and print what it took as JSON."""
     start = time.perf_counter()
-    code = main(['survey', str(path), '--workers', str(workers), '--quiet'])
-    seconds = time.perf_counter() - start
-    if code:
-        sys.exit(f'the survey {name} failed')
-    return seconds
+    code = main(['survey', path, '--workers', workers, '--quiet'])
+    mine, theirs = (resource.getrusage(who) for who in (
+        resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    print(json.dumps({
+        'seconds': time.perf_counter() - start,
+        'driver': mine.ru_utime + mine.ru_stime,
+        'workers': theirs.ru_utime + theirs.ru_stime,
+        'memory': mine.ru_maxrss / 1024}))
+    return code
 
 
-def same(folder, one, other):
-    """Return whether two runs gave the same numbers."""
-    files = sorted((folder / one / 'motions').glob('*/motions.ecsv'))
+def plain(path):
+    """Return the columns of a table as plain arrays."""
+    if path.suffix == '.parquet':
+        from pyarrow import parquet
+        table = parquet.read_table(path)
+        return {name: table[name].to_numpy() for name in table.column_names}
+    if path.suffix != '.ecsv':
+        return {'bytes': path.stat().st_size}
+    table = QTable.read(path)
+    return {name: np.ma.filled(np.ma.asarray(getattr(
+        table[name], 'value', table[name])), 0) for name in table.colnames}
+
+
+def same(one, other):
+    """Return the number of files compared, 0 if any differs."""
+    files = sorted(path for name in TABLES for path in (one / name).rglob('*')
+                   if path.is_file())
     for file in files:
-        twin = folder / other / file.relative_to(folder / one)
-        tables = [QTable.read(path) for path in (file, twin)]
-        if any(not np.array_equal(np.ma.filled(np.ma.asarray(getattr(
-                tables[0][name], 'value', tables[0][name])), 0),
-                np.ma.filled(np.ma.asarray(getattr(
-                    tables[1][name], 'value', tables[1][name])), 0),
-                equal_nan=tables[0][name].dtype.kind == 'f')
-                for name in tables[0].colnames):
-            return False
-    return bool(files)
+        twin = plain(other / file.relative_to(one))
+        for name, values in plain(file).items():
+            if not np.array_equal(values, twin[name], equal_nan=np.asarray(
+                    values).dtype.kind == 'f'):
+                print(f'differs: {file.relative_to(one)} {name}')
+                return 0
+    return len(files)
 
 
-def overhead(folder, n=200):
-    """Return the seconds that a task costs which does nothing."""
+def size_of(folder):
+    """Return the bytes of all files in a folder."""
+    return sum(path.stat().st_size for path in folder.rglob('*')
+               if path.is_file())
+
+
+# Parts.
+
+def speed(folder, options):
+    """Print exposures a minute, and whether results are the same."""
+    (folder / 'raw').mkdir()
+    write_images(folder / 'raw', options.fields, options.epochs, options.size)
+    n = options.fields * options.epochs
+    warm = survey_file(folder, 'warm')
+    warm.write_text(warm.read_text().replace('raw/*', 'raw/field00*'))
+    run_survey(warm, 2, 2)
+    took = {k: run_survey(survey_file(folder, f'with{k}'), k, k)
+            for k in (1, 2)}
+    for k, one in took.items():
+        cpu = one['driver'] + one['workers']
+        print(f'{n} exposures of {options.size}^2, {k} worker(s) on {k} '
+              f'core(s): {one["seconds"]:.0f} s, '
+              f'{60 * n / one["seconds"]:.2f} a minute; '
+              f'{cpu / n:.2f} CPU s an exposure, of which the driver '
+              f'{one["driver"] / n:.2f}')
+    print('efficiency of two: '
+          f'{took[1]["seconds"] / took[2]["seconds"] / 2:.3f} by the clock, '
+          f'{sum_of(took[1]) / sum_of(took[2]):.3f} by CPU time')
+    print('the same to the bit: '
+          f'{same(folder / "with1", folder / "with2")} files')
+    tasks = exposure_tasks(read_survey(folder / 'with2.toml'))
+    import pickle
+    sent = [len(pickle.dumps(task)) for task in tasks]
+    back = [len(pickle.dumps(survey_run.kept_outcome(task)))
+            for task in tasks]
+    print(f'to a worker and back: {np.mean(sent):.0f} and '
+          f'{np.mean(back):.0f} bytes a task; images of '
+          f'{size_of(folder / "raw") / n / 1e6:.2f} MB stay')
+    written = folder / 'with2'
+    parts = {one.name: size_of(one) for one in sorted(written.iterdir())
+             if one.is_dir()}
+    print('written, MB an exposure: ' + ', '.join(
+        f'{name} {size / n / 1e6:.3f}' for name, size in parts.items()))
+
+
+def sum_of(took):
+    """Return the processor's seconds of a run."""
+    return took['driver'] + took['workers']
+
+
+def one_task(folder, _):
+    """Print what a task costs that does nothing."""
+    n = 200
     source = folder / 'nothing.ecsv'
-    QTable({'x': [1.0]}).write(source)
-    tasks = [Task(f't{k}', (), (str(source),), (),
-                  str(folder / 'records' / f't{k}.json')) for k in range(n)]
-    run_tasks(tasks[:4], local_workers(2), lambda _: None)  # processes start
-    start = time.perf_counter()
-    run_tasks(tasks, local_workers(2), lambda _: None)
-    return (time.perf_counter() - start) / n
+    QTable({'x': [1.0] * u.pix}).write(source)
+    tasks = [survey_run.Task(f't{k}', (), (str(source),), (), str(
+        folder / 'records' / f't{k}.json')) for k in range(n)]
+    for some in (tasks[:n // 2], tasks):  # the half is done, and skipped
+        times = []
+        cpu = time.process_time()
+        survey_run.run_tasks(some, survey_run.local_workers(2),
+                             lambda _, times=times: times.append(
+                                 time.perf_counter()))
+        # Until the first one comes back, processes start.
+        print(f'{len(some)} tasks that do nothing: '
+              f'{1e3 * (times[-1] - times[1]) / (len(some) - 2):.1f} ms each,'
+              f' driver {1e3 * (time.process_time() - cpu) / len(some):.1f} '
+              'CPU ms')
 
 
-def run(arguments):
-    """Measure, and print the table."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / 'raw').mkdir()
-        write_images(folder / 'raw', arguments.fields, arguments.epochs,
-                     arguments.size)
-        n = arguments.fields * arguments.epochs
-        run_survey(folder, 'warm', 1, 'field0_*')
-        seconds = {k: run_survey(folder, f'with{k}', k) for k in (1, 2)}
-        for k, value in seconds.items():
-            print(f'{n} exposures, {k} processes: {60 * n / value:.1f} a '
-                  'minute')
-        print(f'efficiency of two: {seconds[1] / seconds[2] / 2:.2f}')
-        print(f'the same to the bit: {same(folder, "with1", "with2")}')
-        print(f'a task that does nothing: {1e3 * overhead(folder):.1f} ms')
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(f'largest memory of the driver: {memory:.0f} MB')
+def memory(folder, options):
+    """Print the largest memory of drivers."""
+    found = {}
+    for n in (options.tiny, 2 * options.tiny):
+        place = folder / str(n)
+        place.mkdir()
+        write_tiny(place, n)
+        path = survey_file(place, 'out', '[photometry]\npsf = "psf.fits"\n')
+        took = run_survey(path, 2, 2)
+        found[n] = took['memory']
+        print(f'{n} tiny exposures: driver {took["memory"]:.1f} MB, '
+              f'{took["driver"]:.1f} CPU s; workers '
+              f'{took["workers"]:.1f} CPU s')
+    few, many = found.values()
+    print(f'twice as many take {100 * (many / few - 1):.1f} % more')
+
+
+def kills(folder, options):
+    """Print what is lost and done twice when processes are killed."""
+    write_tiny(folder, options.tiny)
+    path = survey_file(folder, 'out', '[photometry]\npsf = "psf.fits"\n')
+    rng = np.random.default_rng(options.seed)
+    wanted = ['worker'] * 20 + ['driver'] * 5
+    rng.shuffle(wanted)
+    log = folder / 'log'
+    log.touch()
+    driver = begin(path)
+    step = options.tiny // (len(wanted) + 2)
+    for k, what in enumerate(wanted):
+        while len(lines(log)) < step * (k + 1):
+            time.sleep(0.005)
+            if driver.poll() is not None:
+                sys.exit('the survey ended before all kills')
+        time.sleep(rng.uniform(0, 0.3))
+        if what == 'worker':
+            os.kill(int(lines(log)[-1].split()[1]), signal.SIGKILL)
+        else:
+            driver.kill()
+            driver.wait()
+            driver = begin(path)
+    code = driver.wait()
+    names = [line.split()[0] for line in lines(log)]
+    done = len(list((folder / 'out' / 'records').glob('e*.json')))
+    print(f'20 workers and 5 drivers of 2 workers killed: exit code {code}, '
+          f'{done} of {options.tiny} exposures have results, '
+          f'{len(names) - len(set(names))} were begun again (at most '
+          f'{20 + 2 * 5})')
+
+
+def begin(path):
+    """Start a survey whose tasks are noted."""
+    return subprocess.Popen([sys.executable, __file__, '--noted', str(path)])
+
+
+def lines(log):
+    """Return the whole lines of a log."""
+    return [line for line in log.read_text().splitlines(True)
+            if line.endswith('\n')]
+
+
+def noted(task):
+    """Run a task, and note who works on it."""
+    if (task.kind == 'exposure'
+            and survey_run.kept_outcome(task) is None):
+        with (Path(task.record).parents[2] / 'log').open('a') as log:
+            log.write(f'{task.name} {os.getpid()}\n')
+    return survey_run.run_task(task)
+
+
+def run(options):
+    """Measure, and print."""
+    functions = {'speed': speed, 'task': one_task, 'memory': memory,
+                 'kills': kills}
+    for part in options.parts.split(','):
+        with tempfile.TemporaryDirectory() as name:
+            functions[part](Path(name), options)
 
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--fields', type=int, default=4)
+    parser.add_argument('--parts', default=','.join(PARTS))
+    parser.add_argument('--fields', type=int, default=8)
     parser.add_argument('--epochs', type=int, default=2)
     parser.add_argument('--size', type=int, default=512)
-    run(parser.parse_args())
+    parser.add_argument('--tiny', type=int, default=200)
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--drive', nargs=2)
+    parser.add_argument('--noted')
+    arguments = parser.parse_args()
+    if arguments.drive:
+        sys.exit(drive(*arguments.drive))
+    if arguments.noted:
+        survey_run.run_task = noted
+        sys.exit(main(['survey', arguments.noted, '--workers', '2',
+                       '--quiet']))
+    run(arguments)

@@ -46,6 +46,19 @@ def test_info_says_what_keeps_an_image_from_being_measured(folder, capsys):
     assert main(['info', 'missing.fits']) == 1
 
 
+def test_info_says_that_a_text_is_none_of_the_files(folder, capsys):
+    (folder / 'notes.md').write_text('# Stars\n\nSome *words*.\n')
+    assert main(['info', 'notes.md']) == 1
+    assert capsys.readouterr().err.strip() == (
+        'mgauss: notes.md: must be a table that astropy can read, got a file '
+        'of none of the kinds that it recognises')
+
+
+def test_without_a_command_there_is_help(capsys):
+    assert main([]) == 2
+    assert 'mgauss photometry night1.fits' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(('words', 'written'), [
     ('psf night.fits', ['night_psf.fits']),
     ('photometry night.fits --psf psf.fits', ['night_cat.ecsv'])])

@@ -2,23 +2,32 @@
 import json
 import os
 import re
+import subprocess
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable, vstack
+from numpy.testing import assert_array_equal
 
 from photutils_mgauss import (
+    GaussianMixture,
+    GriddedMixturePSF,
     Instrument,
     paper_exposures,
     simulate_epochs,
     sky_field,
 )
 from photutils_mgauss.cli import main
+from photutils_mgauss.cli.psf_files import psf_record
 from photutils_mgauss.cli.survey_plan import read_survey
 from photutils_mgauss.cli.survey_run import (
-    Outcome,
     Task,
+    cluster_workers,
     kept_outcome,
     local_workers,
     run_task,
@@ -194,21 +203,151 @@ def test_a_task_runs_once_until_something_it_reads_changes(tmp_path):
         'gone', (), (str(tmp_path / 'gone'),), (), 'x')).error.lower()
 
 
-def _kill_once(task):
-    """Take the process down, the first time."""
-    mark = task.record + '.mark'
-    if not os.path.exists(mark):  # noqa: PTH110
-        with open(mark, 'w'):  # noqa: PTH123
-            os.kill(os.getpid(), 9)
-    return Outcome(task.name, seconds=1.0)
+@pytest.fixture
+def light(monkeypatch):
+    """Return the module that processes can import quickly."""
+    folder = str(Path(__file__).parent)
+    monkeypatch.syspath_prepend(folder)
+    return import_module('stand_ins')
 
 
-def test_a_worker_that_dies_loses_nothing(tmp_path, monkeypatch):
+def test_a_worker_that_dies_loses_nothing(tmp_path, monkeypatch, light):
     from photutils_mgauss.cli import survey_run
-    monkeypatch.setattr(survey_run, 'run_task', _kill_once)
+    monkeypatch.setattr(survey_run, 'run_task', light.kill_once)
     tasks = [make_task(tmp_path, f'task{k}') for k in range(3)]
     told = []
     done = run_tasks(tasks, local_workers(2), told.append)
     assert sorted(done) == ['task0', 'task1', 'task2']
     assert not any(outcome.error for outcome in done.values())
     assert len(told) == 3
+
+
+def begin(folder, n):
+    """Start a driver of n tasks."""
+    return subprocess.Popen([sys.executable, str(
+        Path(__file__).with_name('stand_ins.py')), str(folder), str(n)])
+
+
+def wait_until(true, seconds=60):
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def is_gone(pid):
+    try:
+        return 'Z' in Path(f'/proc/{pid}/stat').read_text().split()[2]
+    except OSError:
+        return True
+
+
+def test_what_is_killed_repeats_one_task_each(tmp_path, light):
+    n, kills = 14, 0
+    driver = begin(tmp_path, n)
+    # A worker, in the middle of a task: only its own is done again.
+    wait_until(lambda: len(light.notes(tmp_path)) >= 3)
+    os.kill(int(light.notes(tmp_path)[-1][1]), 9)
+    kills += 1
+    # The driver: its two workers end with it.
+    wait_until(lambda: len(light.notes(tmp_path)) >= 7)
+    driver.kill()
+    driver.wait()
+    kills += 2
+    wait_until(lambda: all(is_gone(pid) for _, pid in light.notes(tmp_path)))
+    known = list((tmp_path / 'records').glob('t*.json'))
+    assert 2 < len(known) < n
+    before = {path: path.stat().st_mtime_ns for path in known}
+    assert begin(tmp_path, n).wait() == 0
+    assert len(list((tmp_path / 'records').glob('t*.json'))) == n
+    begun = [name for name, _ in light.notes(tmp_path)]
+    assert len(set(begun)) == n
+    assert len(begun) <= n + kills
+    # What had a record was not done again.
+    assert before == {path: path.stat().st_mtime_ns for path in known}
+
+
+def test_processes_share_the_cores(monkeypatch):
+    from photutils_mgauss.utils import parallel
+    monkeypatch.setattr(parallel, '_LIMIT', {})
+    cores = parallel.available_cores()
+    parallel.limit_cores(1)
+    assert parallel.available_cores() == 1
+    parallel.limit_cores(cores + 1)
+    assert parallel.available_cores() == cores
+
+
+def test_detectors_and_pixels_are_steps_of_a_survey(images, tmp_path, capsys):
+    pytest.importorskip('pyarrow')
+    path = tmp_path / 'survey.toml'
+    path.write_text(
+        (f'[exposures]\nfiles = "{images}/raw/north*.fits"\n{OPTIONS}'
+         'pixels = true\ntargets = "quasars.ecsv"\n[photometry]\n'
+         'psf = "detector"\n').replace('quasars', f'{images}/quasars')
+        .replace('n_components = 1', 'n_components = 3'))
+    assert main(['survey', str(path), '--workers', '1']) == 0, (
+        capsys.readouterr().err)
+    folder = tmp_path / 'survey'
+    psfs = sorted((folder / 'psfs').rglob('*.fits'))
+    assert [one.name for one in psfs] == ['north0_psf.fits',
+                                          'north1_psf.fits']
+    # One fit, and a width of each exposure.
+    records = [psf_record(one) for one in psfs]
+    assert [one['exposures'] for one in records] == [2, 2]
+    tables = [QTable.read(folder / what / 'field0001' / 'motions.ecsv')
+              for what in ('motions', 'pixels')]
+    for table in tables:
+        assert np.isfinite(table['pmra_error'].value).sum() > 20
+    assert tables[1]['significance'].max() > 50
+    # The frames of the pixels are those of the catalogues.
+    record = tables[1].meta['mgauss']
+    assert sorted(Path(one).stem for one in record['options']['wcs']) == [
+        'north0_wcs', 'north1_wcs']
+    assert record['catalogues']['motions'] > 20
+    assert sorted(one.stem for one in (folder / 'wcs').iterdir()) == [
+        'north0_wcs', 'north1_wcs']
+    assert 'field0001_pixels' in (folder / 'index.html').read_text()
+    before = stamps(folder)
+    assert main(['survey', str(path), '--workers', '1']) == 0
+    assert '0 failed, 5 of an earlier run' in capsys.readouterr().out
+    assert stamps(folder) == before
+
+
+def test_results_are_the_same_whoever_makes_them(images, tmp_path, capsys):
+    pytest.importorskip('pyarrow')
+    from pyarrow import dataset
+    mixture = GaussianMixture([1.0], [[0, 0]], [np.eye(2)])
+    GriddedMixturePSF([mixture], [[0, 0]]).write(tmp_path / 'psf.fits')
+    found = []
+    for workers in ('1', '2'):
+        path = tmp_path / f'{workers}.toml'
+        path.write_text(
+            f'output = "out{workers}"\n[exposures]\nfiles = "{images}/raw/'
+            f'south*.fits"\n[photometry]\npsf = "psf.fits"\n[motions]\n'
+            f'references = "{images}/quasars.ecsv"\n')
+        assert main(['survey', str(path), '--workers', workers]) == 0, (
+            capsys.readouterr().err)
+        found.append(dataset.dataset(
+            tmp_path / f'out{workers}' / 'motions_hats' / 'dataset',
+            format='parquet').to_table())
+    assert found[0].num_rows > 40
+    assert found[0].schema.equals(found[1].schema, check_metadata=True)
+    for name in found[0].column_names:
+        # NaN included.
+        assert_array_equal(*(one[name].to_numpy() for one in found), name)
+
+
+def test_tasks_run_on_a_dask_cluster(tmp_path, light):
+    distributed = pytest.importorskip('distributed')
+    tasks = light.tasks_without_work(tmp_path, 6)
+    told = []
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1,
+                                  processes=False,
+                                  dashboard_address=None) as cluster:
+        workers = cluster_workers(cluster.scheduler_address)
+        done = run_tasks(tasks, workers, told.append)
+        again = run_tasks(tasks, workers, told.append)
+        workers.close()
+    assert workers.number == 2
+    assert not any(one.error or one.skipped for one in done.values())
+    assert all(one.skipped for one in again.values())

@@ -159,3 +159,42 @@ def test_chips_are_matched_by_position(rng):
     assert np.sum(stars['n_good_obs'] == len(YEARS)) > 350
     known = stars['reference_row'] >= 0
     assert known.sum() > 0.95 * len(stars)
+
+
+def test_residuals_in_pixels_show_what_no_map_takes_up():
+    # The distortion is left to the residuals, in pixels of each chip.
+    field = make_field(np.random.default_rng(1), columns=2, rows=1,
+                       per_chip=200, size=1.0)
+    solution = solve(field, 2, distortion=None, clip=None, systematic=None)
+    table = solution.detector_residuals()
+    rows = solution.residuals
+    assert len(table) == len(rows)
+    assert set(table['chip']) == {'0', '1'}
+    # The same residuals by way of the WCS that came back.
+    epoch = solution.epochs[2]
+    own = np.flatnonzero((rows['epoch'] == 2) & (table['chip'] == '1'))
+    wcs = epoch.chips[1]
+    ra, dec = rows['ra'][own], rows['dec'][own]
+    moved = (ra + rows['dra'][own] / np.cos(dec), dec + rows['ddec'][own])
+    before, after = (np.stack(wcs.all_world2pix(
+        at[0].to_value(u.deg), at[1].to_value(u.deg), 0, tolerance=1e-9))
+        for at in ((ra, dec), moved))
+    found = np.stack([table[name][own].value for name in ('dx_pix',
+                                                          'dy_pix')])
+    assert np.abs(found - (after - before)).max() < 1e-3 * np.abs(found).max()
+    assert np.abs(found).max() > 0.1
+
+
+def test_residuals_of_places_on_the_sky_are_in_no_pixels(rng):
+    sky = [Epoch(Table({'id': np.arange(20),
+                        'ra': 10 + rng.uniform(0, 0.01, 20),
+                        'dec': rng.uniform(0, 0.01, 20),
+                        'ra_error': np.ones(20), 'dec_error': np.ones(20)}),
+                 time=year) for year in (2010.0, 2015.0, 2020.0)]
+    for epoch in sky[1:]:
+        epoch.table['ra'] = sky[0].table['ra'] + rng.normal(0, 1, 20) / 3.6e6
+        epoch.table['dec'] = (sky[0].table['dec']
+                              + rng.normal(0, 1, 20) / 3.6e6)
+    table = ProperMotionFitter().fit(sky).detector_residuals()
+    assert len(table) == 60
+    assert np.isnan(table['dx_pix']).all()

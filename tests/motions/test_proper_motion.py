@@ -417,6 +417,23 @@ def test_references_held_out_agree_with_their_catalogue(scene, quasars):
     assert (fit.alignment['n_references'] <= 180).all()
 
 
+def test_references_in_use_are_compared_without_their_catalogue(scene,
+                                                                quasars):
+    fit = ProperMotionFitter(references=quasars, hold_out=0.1,
+                             rng=1).fit(scene[1])
+    table = fit.reference_differences()
+    held = set(np.asarray(fit.validation()['id']).tolist())
+    assert len(table) == 270
+    assert not held & set(np.asarray(table['id']).tolist())
+    # The motions of quasars are zero, so that what was measured is left.
+    measured = fit.measured()
+    rows = [int(np.flatnonzero(measured['id'] == one)[0])
+            for one in table['id']]
+    assert_allclose(table['dpmra'].value, measured['pmra'][rows].value)
+    assert_allclose(np.nanmean(table['chi2']), 2, atol=0.3)
+    assert not ProperMotionFitter().fit(scene[1]).reference_differences()
+
+
 def test_resampled_references_show_the_error_of_the_frames():
     rng = np.random.default_rng(4)
     truth = make_truth(rng, n_stars=100, n_qso=150, sigma=1.0)

@@ -1,4 +1,5 @@
 """Figures of motions contain what they say."""
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
@@ -89,3 +90,35 @@ def test_cutouts_show_each_image_three_times(axes, rng):
         '2024.00', '2026.50']
     with pytest.raises(ValueError, match='at least one row'):
         plot_cutouts(table[:0], ax=axes)
+
+
+def test_references_are_shown_as_they_were_measured(axes, solutions):
+    from photutils_mgauss.plotting import plot_reference_differences
+    table = solutions[1].reference_differences()
+    plot_reference_differences(table, ax=axes)
+    x, y = max((line.get_data() for line in axes.lines),
+               key=lambda data: len(data[0]))
+    assert_allclose(x, table['dpmra'].value)
+    assert_allclose(y, table['dpmdec'].value)
+    assert axes.xaxis_inverted()
+
+
+def test_cells_of_a_map_are_means_of_their_residuals(axes, rng):
+    from photutils_mgauss.plotting import plot_residual_map
+    n = 4000
+    x, y = rng.uniform(0, 1000, (2, n))
+    # A shear, in noise ten times as large as it.
+    table = QTable({'chip': np.full(n, '2'), 'x_pix': x * u.pix,
+                    'y_pix': y * u.pix,
+                    'dx_pix': (1e-5 * (y - 500)
+                               + rng.normal(0, 0.02, n)) * u.pix,
+                    'dy_pix': rng.normal(0, 0.02, n) * u.pix})
+    plot_residual_map(table, '2', n_cells=5, ax=axes)
+    arrows = list(axes.collections)
+    places = np.concatenate([one.get_offsets() for one in arrows])
+    mean = np.concatenate([one.U for one in arrows])
+    assert len(places) == 25
+    assert_allclose(mean, 1e-5 * (places[:, 1] - 500), atol=5 * 0.02 / 12)
+    assert len(arrows[1].U) > 5
+    with pytest.raises(ValueError, match="chip '7'"):
+        plot_residual_map(table, '7', ax=axes)

@@ -52,6 +52,11 @@ def test_parameters_come_in_the_promised_order():
 
 @given(mixtures(signed=True))
 @settings(**SETTINGS)
+def test_the_width_of_a_model_is_that_of_its_mixture(mixture):
+    model = MultiGaussianPSFModel(mixture, flux=7, x_0=3)
+    assert_allclose(model.fwhm, mixture.fwhm, rtol=1e-9)
+
+
 def test_the_model_gives_its_mixture_back(mixture):
     model = MultiGaussianPSFModel(mixture, x_0=3)
     assert_allclose(model.weights, mixture.weights, rtol=1e-12, atol=1e-14)

@@ -1,0 +1,44 @@
+"""The stars of an image that its PSF is fitted to."""
+from photutils_mgauss.cli import tools
+
+_RADIUS = 10.0
+
+
+def check_image(image):
+    """Raise if an image cannot be measured, and before any is."""
+    with tools.about(image.path):
+        image.check()
+
+
+def fit_options(options):
+    """Return the options of `fit_mixture_field` that are given."""
+    given = {name: getattr(options, name)
+             for name in ('n_components', 'degree', 'radius')}
+    return {'radius': _RADIUS} | {name: value for name, value
+                                  in given.items() if value is not None}
+
+
+def choose(image, radius, options):
+    """Return the stars of an image, with those selected for its PSF."""
+    from photutils_mgauss.field.selection import select_psf_stars
+    from photutils_mgauss.files.tables import read_table
+    sources = None
+    if options.stars is not None:
+        sources, _ = read_table(options.stars)
+    saturation = image.saturation
+    if saturation is not None:
+        # The level is that of the image with its sky.
+        saturation -= float(image.sky.background_median)
+    return select_psf_stars(
+        image.without_sky, sources, error=image.noise.total, mask=image.mask,
+        radius=radius, saturation=saturation, min_snr=options.min_snr,
+        max_stars=options.max_stars)
+
+
+def no_stars(image, stars):
+    """Return why no star was good enough."""
+    reasons = [str(reason) for reason in stars['reason']]
+    counts = ', '.join(f'{reasons.count(reason)} {reason}'
+                       for reason in sorted(set(reasons)))
+    return (f'{image.path}: must have at least 1 star good for the PSF, got '
+            f'none of {len(stars)}: {counts}; try --min-snr or --radius')
