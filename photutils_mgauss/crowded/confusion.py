@@ -76,31 +76,41 @@ class Confusion:
         return cls(np.zeros(n), np.zeros(n), np.zeros(n))
 
     @classmethod
-    def of(cls, tile, flux_err):
+    def of(cls, model, origin, equations, flux_err, *, flux=None, share=1.0):
         """
         Find what is hidden beside the stars of a tile.
 
         Parameters
         ----------
-        tile : Tile
+        model : Model
             Solved.
+        origin : (y, x) tuple
+            Where in the image the tile begins.
+        equations : Equations
+            Of the model.
         flux_err : (n,) `~numpy.ndarray`
             The errors of fluxes due to the noise of pixels.
+        flux : (n,) `~numpy.ndarray`, optional
+            What is expected of fluxes where these are noise; those of the
+            model by default.
+        share : float, optional
+            The standard error of a star's flux by all images in which stars
+            are looked for, as a fraction of that by this one.
         """
-        model, stars = tile.model, tile.model.stars
-        seen = np.isfinite(flux_err) & (flux_err > 0) & (stars.flux > 0)
-        counts = Counts.of(model, tile.origin,
-                           np.where(seen, flux_err, np.nan))
+        stars = model.stars
+        flux = stars.flux if flux is None else flux
+        seen = np.isfinite(flux_err) & (flux_err > 0) & (flux > 0)
+        counts = Counts.of(model, origin, np.where(seen, flux_err, np.nan))
         if not (counts.number[seen] > 0).any():
             return cls.none(len(stars))
         variance = _variance_beneath(model)
-        flux = np.maximum(stars.flux, 1e-300) / np.sqrt(variance)
+        scaled = np.maximum(flux, 1e-300) / np.sqrt(variance)
         number = counts.number * variance**((1 - counts.slope) / 2)
-        law = Law.of(model, counts, np.median(variance[seen]), number)
-        squares, medians = law.at(flux, number)
-        answers = _SHARE * tile.equations.answers_to_light()
+        law = Law.of(model, counts, np.median(variance[seen]), number, share)
+        squares, medians = law.at(scaled, number)
+        answers = _SHARE * equations.answers_to_light()
         light = medians * flux_err - answers * law.hidden.light(counts)
-        largest = _LARGEST_PART * stars.flux
+        largest = _LARGEST_PART * flux
         return cls(*np.where(seen, np.sqrt(squares), 0),
                    np.where(seen, np.clip(light, -largest, largest), 0))
 
@@ -219,13 +229,14 @@ class Law:
         self.squares, self.medians = squares, medians
 
     @classmethod
-    def of(cls, model, counts, variance, numbers):
+    def of(cls, model, counts, variance, numbers, share=1.0):
         """Tabulate the law in the middle of a tile for numbers (n,)."""
         ny, nx = model.data.shape
         beside = _Beside(model.psf, nx / 2, ny / 2)
         limit = model.options.faintest / beside.at_centres
+        # Counts are not continued further than to what one image can show.
         faint = limit * np.sqrt(model.psf.area)
-        hidden = Hidden(limit, counts.slope, faint * np.sqrt(variance))
+        hidden = Hidden(limit, counts.slope, faint * np.sqrt(variance), share)
         top = max(model.stars.flux.max() / np.sqrt(variance), 100 * faint)
         fluxes = np.geomspace(faint, top, _N_FLUXES)
         numbers = np.concatenate([[0], np.geomspace(
@@ -264,12 +275,18 @@ class Hidden:
     ``limit`` is the significance at which every second star is found,
     ``slope`` the power of their numbers, and ``faintest`` the flux of the
     faintest: of those that can be seen where no star is. Even fainter ones
-    are everywhere, and noise of the sky.
+    are everywhere, and noise of the sky. Where stars are looked for in many
+    images, errors by all are ``share`` of those by this one.
     """
 
     limit: float
     slope: float
     faintest: float
+    share: float = 1.0
+
+    def chance(self, flux, error):
+        """Return the chance that a star is not found, of errors here."""
+        return ndtr(self.limit - flux / (self.share * error))
 
     def fluxes(self, low, high):
         """Return fluxes, and numbers about them for a density of 1."""
@@ -282,9 +299,10 @@ class Hidden:
         """Return the light a pixel has of them around stars (n,)."""
         error = counts.error
         flux, density = self.fluxes(
-            self.faintest, (self.limit + 4) * max(error.max(), self.faintest))
+            self.faintest, (self.limit + 4) * self.share * max(error.max(),
+                                                                self.faintest))
         return counts.number * sum(
-            f * n * ndtr(self.limit - f / error)
+            f * n * self.chance(f, error)
             for f, n in zip(flux, density, strict=True))
 
 
@@ -329,12 +347,15 @@ class _Beside:
         """
         z, merged, error = self._responses(flux, photons)
         g, density = hidden.fluxes(faint, flux)
-        chance = ndtr(hidden.limit - g / error[:, None])
+        chance = hidden.chance(g, error[:, None])
         # What is too close to be told apart is not found however bright.
         chance[merged] = 1
         rate = density * chance * self.step**2
-        flux_law, *place_laws = (_laws(part[:, None] * g, rate, numbers)
-                                 for part in z)
+        # All images see a place together.
+        units = 1, hidden.share, hidden.share
+        flux_law, *place_laws = (
+            _laws(part[:, None] * g / unit, rate, numbers)
+            for part, unit in zip(z, units, strict=True))
         medians = np.array([_quantile(law, 0.5) for law in flux_law])
         return np.stack([
             _squares(flux_law, medians),

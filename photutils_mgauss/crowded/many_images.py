@@ -99,7 +99,8 @@ def _table(plan, outcomes, field):
     reach = reach_of(plan.factors)[2:]
     spread = np.sqrt(np.einsum('nii->ni', stars.place[:, 2:, 2:]))
     rate = np.where(spread * reach < FARTHEST / 2, stars.rate, np.nan)
-    table = as_qtable(stars, field.unit, meta)
+    table = as_qtable(stars, field.unit, meta,
+                      confusion=plan.options.confusion)
     add_places(table, plan.grid, *place)
     if plan.factors.shape[2] > 2:
         add_motions(table, plan.grid, *place, rate, field.years.mean())

@@ -3,6 +3,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from photutils_mgauss.crowded.confusion import Confusion
 from photutils_mgauss.crowded.judge import smooth_light
 from photutils_mgauss.crowded.many_search import strength_of
 from photutils_mgauss.crowded.stars import Stars
@@ -14,6 +15,7 @@ from photutils_mgauss.crowded.table import (
     NO_FLUX,
     STILL,
     inside,
+    misfit,
     quality_of,
     significant,
     unlike_a_star,
@@ -31,7 +33,8 @@ _COLUMNS = ('number', 'x', 'y', 'x_init', 'y_init', 'rate', 'place',
             'significance', 'n_images', 'reduced_chi2', 'flags',
             'neighbor_distance', 'neighbor_correlation', 'found_in')
 _WHOLE = ('number', 'n_images', 'flags', 'found_in')
-_EACH = ('x_image', 'y_image', 'fluxes', 'flux_err', 'local_bkg',
+_HIDDEN = 'flux_confusion_err', 'flux_confusion'
+_EACH = ('x_image', 'y_image', 'fluxes', 'flux_err', *_HIDDEN, 'local_bkg',
          'n_pixels_fit', 'image_chi2', 'crowding')
 _COUNTS = ('n_pixels_fit',)
 
@@ -52,10 +55,12 @@ def tabulate(tile):
     s, near = tile.stars, tile.neighbours
     quality = [quality_of(model) for model in tile.models]
     place, variance, correlation = tile.equations.covariances()
-    factor = np.array([_unseen(one) for one in quality])
+    hidden = _hidden(tile, variance)
+    factor = np.array([misfit(one) for one in quality])
     count, chi2 = (np.array([one[:, i] for one in quality]) for i in (0, 1))
     informed = np.nan_to_num(tile.fluxes**2 / variance)
-    place = place * _mean(factor, informed)[:, None, None]
+    place = place * _mean(factor * (1 + np.array(
+        [one.position for one in hidden])**2), informed)[:, None, None]
     variance = np.where(count > 0, variance * factor, np.nan)
     strength, _ = strength_of(tile, variance)
     strength = np.nan_to_num(strength)
@@ -69,7 +74,7 @@ def tabulate(tile):
         flags=_flags(tile, quality, place, strength, correlation[best]),
         neighbor_distance=near.distance,
         neighbor_correlation=correlation[best],
-        **_each(tile, quality, variance))
+        **_each(tile, quality, variance, hidden))
     table = table.chosen(significant(s, tile.options.threshold, strength))
     table = Stars.of_columns({name: getattr(table, name)
                               for name in (*_COLUMNS, *_EACH)})
@@ -78,16 +83,23 @@ def tabulate(tile):
     return table.chosen(inside(table, tile.job.core))
 
 
-def _unseen(quality):
-    """
-    Return the factor of the variance for light that is in no star's model.
-
-    What is left of stars that were not found raises the chi2 of a stamp.
-    """
-    count, chi2 = quality[:, 0], quality[:, 1]
-    # Each star has taken about three degrees of freedom from its stamp; six
-    # pixels' worth of prior keeps small numbers from swinging.
-    return np.maximum((chi2 + 6) / np.maximum(count + 3, 6), 1.0)
+def _hidden(tile, variance):
+    """Return what stars that were not found do in each image."""
+    options = tile.options
+    if not options.confusion or not options.find_neighbors:
+        return [Confusion.none(len(tile.stars))] * len(tile.models)
+    known = np.where(variance > 0, tile.scales**2 / variance, 0)
+    total = known.sum(axis=0)
+    out = []
+    for k, (model, one) in enumerate(zip(tile.models, tile.equations.each,
+                                         strict=True)):
+        seen = known[k] > 0
+        share = np.sqrt(np.median(known[k][seen] / total[seen])) if (
+            seen.any()) else 1.0
+        out.append(Confusion.of(
+            model, tile.job.parts[k].origin, one, np.sqrt(variance[k]),
+            flux=tile.job.scales[k] * tile.stars.flux, share=share))
+    return out
 
 
 def _mean(values, weights):
@@ -96,17 +108,23 @@ def _mean(values, weights):
                      where=total > 0, out=np.ones(total.size))
 
 
-def _each(tile, quality, variance):
+def _each(tile, quality, variance, hidden):
     """Return the columns (n, E) of all images, NaN where they show nothing."""
     n, job = len(tile.stars), tile.job
     out = {name: np.full((n, job.n_images), np.nan) for name in _EACH}
     out['n_pixels_fit'] = np.zeros((n, job.n_images), int)
-    for k, (model, one) in enumerate(zip(tile.models, quality, strict=True)):
+    for k, (model, one, unseen) in enumerate(zip(
+            tile.models, quality, hidden, strict=True)):
         stars, seen = model.stars, one[:, 0] > 0
         row, column = job.parts[k].origin
+        error = np.sqrt(variance[k])
+        added = error * unseen.flux
         for name, values in (
                 ('x_image', stars.x + column), ('y_image', stars.y + row),
-                ('fluxes', stars.flux), ('flux_err', np.sqrt(variance[k])),
+                ('fluxes', stars.flux - unseen.light),
+                ('flux_err', np.hypot(error, added)),
+                ('flux_confusion_err', added),
+                ('flux_confusion', unseen.light),
                 ('local_bkg', model.background_at(stars.x, stars.y)),
                 ('n_pixels_fit', one[:, 0].astype(int)),
                 ('image_chi2', one[:, 1] / np.maximum(one[:, 0] - 3, 1)),
@@ -139,7 +157,7 @@ def _flags(tile, quality, place, strength, correlation):
     return flags
 
 
-def as_qtable(stars, unit, meta):
+def as_qtable(stars, unit, meta, *, confusion):
     """Return the stars as a table; empties what is given."""
     columns = vars(stars)
     n = columns['x'].size
@@ -148,7 +166,7 @@ def as_qtable(stars, unit, meta):
     out['x_fit'] = columns.pop('x_image') * u.pix
     out['y_fit'] = columns.pop('y_image') * u.pix
     out['flux'] = columns.pop('fluxes') * light
-    for name in ('flux_err', 'local_bkg'):
+    for name in ('flux_err', *(_HIDDEN if confusion else ()), 'local_bkg'):
         out[name] = columns.pop(name) * light
     for name in ('n_images', 'n_pixels_fit', 'significance', 'reduced_chi2',
                  'image_chi2', 'flags', 'crowding', 'neighbor_distance',

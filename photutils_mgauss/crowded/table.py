@@ -63,7 +63,7 @@ def tabulate(tile, core):
     quality = quality_of(model)
     covariance, correlation = tile.equations.covariances()
     hidden = _hidden(tile, covariance)
-    covariance = covariance * _misfit(quality)[:, None, None]
+    covariance = covariance * misfit(quality)[:, None, None]
     with np.errstate(invalid='ignore'):
         error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     count, chi2, deviation, centre, crowding, _ = quality.T
@@ -129,7 +129,7 @@ def quality_of(model):
     return out
 
 
-def _misfit(quality):
+def misfit(quality):
     """
     Return the factor of the variance where the model does not fit.
 
@@ -148,7 +148,7 @@ def _hidden(tile, covariance):
         return Confusion.none(n)
     with np.errstate(invalid='ignore'):
         error = np.sqrt(covariance[:, 0, 0])
-    return Confusion.of(tile, error)
+    return Confusion.of(tile.model, tile.origin, tile.equations, error)
 
 
 def _with_hidden(stars, error, xy_cov, hidden):

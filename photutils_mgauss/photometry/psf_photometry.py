@@ -13,6 +13,7 @@ minimizes
 stars of a group together.
 """
 import warnings
+from functools import partial
 
 import numpy as np
 from astropy.nddata import NDData
@@ -31,6 +32,7 @@ from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
 from photutils_mgauss.photometry.saturated import (
     SaturatedStars,
     flag,
+    with_measured_wings,
     with_misfit,
 )
 from photutils_mgauss.utils import compat
@@ -250,6 +252,10 @@ class MixturePSFPhotometry(PSFPhotometry):
         self.init_params = init_params
         image = self._make_image(data, mask, error)
         result, group_size = self._fit_contexts(image, init_params)
+        if not self.psf_model.contexts:
+            result, image = with_measured_wings(
+                result, image, self.psf_model,
+                partial(self._fit_again, init_params))
         result = with_misfit(result, error is not None
                              or self.effective_gain is not None)
         correlation = self._correlation(image, result)
@@ -403,6 +409,12 @@ class MixturePSFPhotometry(PSFPhotometry):
             progress_bar=self.progress_bar)
         _check_errors(fits, stars)
         return start.result(rows, fits), counts[inverse]
+
+    def _fit_again(self, init_params, image, rows):
+        """Return the FitResult of stars and their groups, and their rows."""
+        groups = np.asarray(init_params['group_id'])
+        some = np.flatnonzero(np.isin(groups, groups[rows]))
+        return self._fit(image, init_params[some])[0], some
 
     def _make_table(self, result, group_size, data_shape, has_error,
                     psf_part):

@@ -1,5 +1,5 @@
 """Results, tables and flags of PSF photometry, as photutils makes them."""
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -89,6 +89,14 @@ class FitResult:
     def errors(self):
         """The standard errors of flux, x and y, (n, 3)."""
         return np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+
+    def updated(self, other, rows):
+        """Return the results with those of another fit in some rows."""
+        changed = {}
+        for name in ('values', 'covariances', 'sky', 'sums', 'outcome'):
+            changed[name] = getattr(self, name).copy()
+            changed[name][rows] = getattr(other, name)
+        return replace(self, **changed)
 
 
 class FitInfo:

@@ -26,6 +26,14 @@ every list with a cubic fitted on bright stars. The bound is that of the
 star alone; it is read from ``bound.npy`` (x and y of each true star, with the
 true PSF) or, without that file, made with our PSF, which is up to 10 %
 smaller.
+
+With ``--bars`` it needs no folders: it prints one table of what is asked of
+crowded photometry and what is measured, in scenes simulated with this package
+or, with ``--harness DIR --optics FILE``, with the optics of another simulator,
+a folder with its modules csst_psf and csst_scene and a file of its optics: a
+bulge field (``even``), a sloping sky (``plane``), clusters (``cluster``),
+galaxies (``galaxy``), the PSF of the image's own stars (``own``), saturated
+stars (``saturated``), and four images together (``images``).
 """
 import argparse
 import shutil
@@ -34,6 +42,7 @@ import warnings
 from pathlib import Path
 
 import crowded_area
+import crowded_bars
 import crowded_peers as peers
 import numpy as np
 from astropy.table import Table
@@ -247,8 +256,16 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('crowded')
-    parser.add_argument('sparse')
+    parser.add_argument('crowded', nargs='?')
+    parser.add_argument('sparse', nargs='?')
+    parser.add_argument('--bars', nargs='*', choices=crowded_bars.PARTS)
+    parser.add_argument('--harness', metavar='DIR')
+    parser.add_argument('--optics', metavar='FILE')
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--size', type=int, default=512)
+    parser.add_argument('--own-size', type=int, default=768,
+                        help='that of the scenes own and saturated')
+    parser.add_argument('--images-size', type=int, default=400)
     parser.add_argument('--parts', nargs='+', choices=PARTS, default=PARTS)
     parser.add_argument('--crop', type=int)
     parser.add_argument('--small', type=int, default=512)
@@ -260,6 +277,12 @@ def main():
                         default=[512, 1024, 2048])
     parser.add_argument('--threads', type=int, default=2)
     args = parser.parse_args()
+    if args.bars is not None:
+        args.bars = args.bars or crowded_bars.PARTS
+        crowded_bars.run(args)
+        return
+    if not args.sparse:
+        parser.error('give CROWDED and SPARSE, or --bars')
     peers.report_missing(args.crowdsource)
     parts = {'peers': peers_part, 'given': given_part, 'curve': curve_part,
              'area': area_part}

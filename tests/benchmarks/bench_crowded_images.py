@@ -25,7 +25,11 @@ from astropy.nddata import NDData, StdDevUncertainty
 from astropy.wcs import WCS
 from scipy.spatial import cKDTree
 
-from photutils_mgauss import CrowdedMixturePhotometry, ImageEpoch
+from photutils_mgauss import (
+    CrowdedMixturePhotometry,
+    GriddedMixturePSF,
+    ImageEpoch,
+)
 
 SCALE, MARGIN, RIM, RADIUS = 74.0, 20, 3, 0.7
 NOT_STARS = 262144 | 65536
@@ -44,7 +48,7 @@ def make_wcs(size, turn=0.0, x=0.0, y=0.0):
 class Field:
     """Exposures of one field, and the truth in pixels of the first."""
 
-    def __init__(self, args, psf):
+    def __init__(self, args, optics):
         rng = np.random.default_rng(args.seed)
         self.size, n = args.size, args.images
         truth = light.even_stars(self.size + 2 * MARGIN, args.seed)
@@ -66,7 +70,7 @@ class Field:
                 self.frames[0].pixel_to_world(self.x - shift[0],
                                               self.y + shift[1]))
             self.flux.append(np.asarray(one['flux']))
-            drawn = light.draw(psf, one, (self.size, self.size))
+            drawn = optics.draw(one, (self.size, self.size))
             self.scenes.append(light.expose(drawn, one,
                                             1000 * args.seed + k).images)
         self.flux = np.array(self.flux)
@@ -92,9 +96,9 @@ class Field:
 class Listed:
     """Stars in pixels of the first image, with their fluxes (n, E)."""
 
-    def __init__(self, x, y, flux, error, motion=None):
+    def __init__(self, x, y, flux, error, common, motion=None):
         self.x, self.y, self.flux, self.error = x, y, flux, error
-        self.motion = motion
+        self.common, self.motion = common, motion
 
     def match(self, field):
         """Return the rows (n,) of true stars, -1 for none."""
@@ -107,14 +111,19 @@ class Listed:
     def mean(self):
         """Return the mean flux (n,) in images of the first filter."""
         half = (self.flux.shape[1] + 1) // 2
-        return mean(self.flux[:, :half], self.error[:, :half])[0]
+        return mean(self, slice(None), slice(half))[0]
 
 
-def mean(flux, error):
-    """Return weighted means of the known fluxes, and their errors."""
+def mean(listed, rows, images):
+    """Return weighted means of known fluxes in images, and their errors."""
+    flux, error, common = (values[rows, images] for values in (
+        listed.flux, listed.error, listed.common))
     weight = np.where(np.isfinite(flux) & (error > 0), error**-2.0, 0)
-    total = np.maximum(weight.sum(axis=1), 1e-300)
-    return (np.nansum(flux * weight, axis=1) / total, total**-0.5)
+    weight /= np.maximum(weight.sum(axis=1), 1e-300)[:, None]
+    # Stars that are hidden in one image are hidden in all.
+    square = (np.nansum(weight**2 * (error**2 - common**2), axis=1)
+              + np.nansum(weight * common, axis=1)**2)
+    return np.nansum(flux * weight, axis=1), np.sqrt(square)
 
 
 def together(field, psf, motions, pool):
@@ -129,7 +138,8 @@ def together(field, psf, motions, pool):
     motion = (np.array([table[name].value for name in ('pmra', 'pmdec')])
               if motions else None)
     return Listed(x, y, np.asarray(table['flux']),
-                  np.asarray(table['flux_err']), motion), seconds
+                  np.asarray(table['flux_err']),
+                  np.asarray(table['flux_confusion_err']), motion), seconds
 
 
 def each_alone(field, psf, pool):
@@ -145,7 +155,8 @@ def each_alone(field, psf, pool):
         x, y = field.frames[0].world_to_pixel(wcs.pixel_to_world(
             table['x_fit'], table['y_fit']))
         out.append(Listed(x, y, np.asarray(table['flux_fit'])[:, None],
-                          np.asarray(table['flux_err'])[:, None]))
+                          np.asarray(table['flux_err'])[:, None],
+                          np.asarray(table['flux_confusion_err'])[:, None]))
     return out, np.mean(seconds)
 
 
@@ -154,13 +165,14 @@ def averaged(lists, years):
     first = lists[0]
     n = len(first.x)
     place = np.full((len(lists), 2, n), np.nan)
-    flux, error = np.full((2, n, len(lists)), np.nan)
+    flux, error, common = np.full((3, n, len(lists)), np.nan)
     for k, one in enumerate(lists):
         away, row = cKDTree(np.column_stack([one.x, one.y])).query(
             np.column_stack([first.x, first.y]))
         near = away < RADIUS
         flux[near, k] = one.flux[row[near], 0]
         error[near, k] = one.error[row[near], 0]
+        common[near, k] = one.common[row[near], 0]
         place[k, 0, near] = one.x[row[near]]
         place[k, 1, near] = one.y[row[near]]
     t = (years - years.mean())[:, None, None] + 0 * place
@@ -169,12 +181,17 @@ def averaged(lists, years):
     with np.errstate(invalid='ignore', divide='ignore'):
         rate = np.nansum(t * place, axis=0) / np.nansum(t * t, axis=0)
     rate[known < 2] = np.nan
-    return Listed(first.x, first.y, flux, error,
+    return Listed(first.x, first.y, flux, error, common,
                   SCALE * rate * [[-1], [1]])
 
 
 def scatter(values):
     return 1.48 * np.nanmedian(np.abs(values)) if values.size else np.nan
+
+
+def width(values):
+    """Return the scatter about the median."""
+    return scatter(values - np.nanmedian(values)) if values.size else np.nan
 
 
 def complete_at(field, row, mag):
@@ -194,25 +211,28 @@ def print_list(name, field, listed, seconds):
     row = listed.match(field)
     half = (len(field.frames) + 1) // 2
     print(f'\n{name}: {len(listed.x)} stars, {seconds:.1f} CPU s\n mag      n'
-          '  complete  flux bias [mag]  colour bias [sigma]  pull of flux')
+          '  complete  flux bias [mag]  colour bias [sigma]  pull of mean flux'
+          '  of each')
     for low in range(18, 26):
         here = field.inside & (field.mag >= low) & (field.mag < low + 1)
         found = here & (row >= 0)
         at = row[found]
-        one, e_one = mean(listed.flux[at, :half], listed.error[at, :half])
+        one, e_one = mean(listed, at, slice(half))
         colour = np.nan
         if half < listed.flux.shape[1]:
-            two, e_two = mean(listed.flux[at, half:], listed.error[at, half:])
+            two, e_two = mean(listed, at, slice(half, None))
             both = (one > 0) & (two > 0)
             ratio = np.log(two[both] / one[both])
             true = np.log(field.flux[-1][found] / field.flux[0][found])[both]
             colour = np.median((ratio - true) / np.hypot(
                 e_one[both] / one[both], e_two[both] / two[both]))
         true = field.flux[0][found]
+        truth = field.flux[:listed.flux.shape[1], found].T
         bias = -2.5 * np.log10(np.median(one / true)) if at.size else np.nan
         print(f'{low}-{low + 1} {here.sum():6d}  '
               f'{found.sum() / max(here.sum(), 1):8.1%}  {bias:+15.4f}  '
-              f'{colour:+19.2f}  {scatter((one - true) / e_one):12.2f}')
+              f'{colour:+19.2f}  {width((one - true) / e_one):17.2f}  '
+              f'{width((listed.flux[at] - truth) / listed.error[at]):7.2f}')
     return row
 
 
@@ -246,10 +266,9 @@ def main():
     if args.quick:
         args.size, args.images = 128, 2
     warnings.simplefilter('ignore')
-    psf = light.make_psf(args.size, args.seed)
-    if args.psf:
-        psf = type(psf).read(args.psf)
-    field = Field(args, psf)
+    optics = (light.Optics(GriddedMixturePSF.read(args.psf)) if args.psf
+              else light.Optics.of(args.size, args.seed))
+    psf, field = optics.psf, Field(args, optics)
     with ThreadPoolExecutor(1) as pool:
         alone, single = each_alone(field, psf, pool)
         joint, seconds = together(field, psf, args.motions, pool)

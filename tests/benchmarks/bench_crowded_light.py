@@ -75,6 +75,7 @@ def print_even(name, scene, table, seconds):
     print(f'\n{name}: {len(table)} stars, {seconds:.1f} CPU s, reduced_chi2 '
           f'{table.meta["reduced_chi2"]:.3f}\n mag     n   RMS/CRLB  complete'
           '  false   flux bias  pull x, y  flux')
+    rows = []
     for low, here, there in score.bins():
         found = here & (row >= 0)
         error = errors[found]
@@ -82,36 +83,41 @@ def print_even(name, scene, table, seconds):
                                  for c in 'xy'])
         off, flux_width, true = flux_error(score, found)
         pull = off / flux_width
-        print(f'{low}-{low + 1} {here.sum():5d}  '
-              f'{scatter(error / scene.bound[found]):7.2f}  '
-              f'{found.sum() / max(here.sum(), 1):8.1%}  '
-              f'{(score.false & there).sum() / max(there.sum(), 1):6.1%}  '
-              f'{-2.5 * np.log10(1 + np.median(off / true)):+8.4f}  '
-              f'{scatter(error / width):7.2f}  '
-              f'{scatter(pull - np.nanmedian(pull)):6.2f}')
+        rows.append((low, here.sum(), scatter(error / scene.bound[found]),
+                     found.sum() / max(here.sum(), 1),
+                     (score.false & there).sum() / max(there.sum(), 1),
+                     -2.5 * np.log10(1 + np.median(off / true)),
+                     scatter(error / width),
+                     scatter(pull - np.nanmedian(pull))))
+        print('{0}-{8} {1:5d}  {2:7.2f}  {3:8.1%}  {4:6.1%}  {5:+8.4f}  '
+              '{6:7.2f}  {7:6.2f}'.format(*rows[-1], low + 1))
+    return np.array(rows, float)
 
 
-def even_part(args, psf):
+def even_part(args, optics):
+    rows = []
     for seed in args.seeds:
-        scene = even_scene(args, psf, seed)
-        print_even(f'even stars, seed {seed}', scene, *reduce(psf, scene))
+        scene = even_scene(args, optics, seed)
+        rows.append(print_even(f'even stars, seed {seed}', scene,
+                               *reduce(optics.psf, scene)))
+    return rows
 
 
-def even_scene(args, psf, seed):
+def even_scene(args, optics, seed):
     truth = light.even_stars(args.size, seed)
     shape = args.size, args.size
-    return light.expose(light.draw(psf, truth, shape), truth,
-                        seed).bounded(psf)
+    return light.expose(optics.draw(truth, shape), truth,
+                        seed).bounded(optics.psf)
 
 
-def plane_part(args, psf):
-    scene = even_scene(args, psf, args.seeds[0])
+def plane_part(args, optics):
+    scene = even_scene(args, optics, args.seeds[0])
     x = np.arange(scene.size)
     # The same errors: it is the answer to the same noise that is asked for.
-    before, _ = reduce(psf, scene)
+    before, _ = reduce(optics.psf, scene)
     scene.images['sci'] = scene.images['sci'] + 3 * x
-    after, _ = reduce(psf, scene)
-    print_plane(before, after, scene)
+    after, _ = reduce(optics.psf, scene)
+    return print_plane(before, after, scene)
 
 
 def print_plane(before, after, scene):
@@ -128,6 +134,7 @@ def print_plane(before, after, scene):
           f'{np.percentile(np.abs(change), 99):.3f}, largest '
           f'{np.abs(change).max():.3f}, {np.mean(np.abs(change) > 0.2):.2%} '
           'beyond 0.2')
+    return len(both[0]), np.mean(np.abs(change) > 0.2), len(new)
 
 
 def replace_truth(scene, table):
@@ -137,16 +144,19 @@ def replace_truth(scene, table):
     return replace(scene, truth=truth)
 
 
-def cluster_part(args, psf):
+def cluster_part(args, optics):
+    rows = []
     for seed, centre, kind in ((args.seeds[0], 0.5, 'masked'),
                                (args.seeds[1], 0.3, 'nan')):
         truth = light.cluster_stars(args.size, seed, centre)
         shape = args.size, args.size
         scene = light.without_core(
-            light.expose(light.draw(psf, truth, shape), truth, seed), CORE,
-            kind).bounded(psf)
-        print_cluster(f'cluster of {centre} stars/px in the middle, core '
-                      f'{kind}', scene, centre, *reduce(psf, scene))
+            light.expose(optics.draw(truth, shape), truth, seed), CORE,
+            kind).bounded(optics.psf)
+        rows.append(print_cluster(
+            f'cluster of {centre} stars/px in the middle, core {kind}', scene,
+            centre, *reduce(optics.psf, scene)))
+    return rows
 
 
 def print_cluster(name, scene, centre, table, seconds):
@@ -164,6 +174,7 @@ def print_cluster(name, scene, centre, table, seconds):
           f'flagged, {seconds:.1f} CPU s, reduced_chi2 '
           f'{table.meta["reduced_chi2"]:.3f}\n stars/px   mag        n '
           'complete (flagged too)  bias  RMS/CRLB pull x, y  flux  false')
+    rows = []
     for low, high in pairwise(DENSITIES):
         for m_low, m_high in ((17, 19), (19.5, 20.5), (21.5, 22.5)):
             here = (good.counted & (density >= low) & (density < high)
@@ -176,23 +187,31 @@ def print_cluster(name, scene, centre, table, seconds):
                                      for c in 'xy'])
             near = ((there >= low) & (there < high) & good.listed
                     & (listed_mag >= m_low) & (listed_mag < m_high))
-            print(f'{low:.2f}-{high:.2f} {m_low}-{m_high} {here.sum():5d}  '
-                  f'{found[here].mean():7.1%} ({listed[here].mean():.1%})  '
-                  f'{-2.5 * np.log10(1 + np.median(off / true)):+8.4f}  '
-                  f'{scatter(errors[at] / scene.bound[at]):6.2f}  '
-                  f'{scatter(errors[at] / error):6.2f}  '
-                  f'{scatter(off / width):6.2f}  '
-                  f'{(good.false & near).sum() / max(near.sum(), 1):6.1%}')
+            row = (low, m_low, here.sum(), found[here].mean(),
+                   listed[here].mean(),
+                   -2.5 * np.log10(1 + np.median(off / true)),
+                   scatter(errors[at] / scene.bound[at]),
+                   scatter(errors[at] / error), scatter(off / width),
+                   (good.false & near).sum() / max(near.sum(), 1))
+            rows.append(row)
+            print('{0:.2f}-{10:.2f} {1}-{11} {2:5d}  {3:7.1%} ({4:.1%})  '
+                  '{5:+8.4f}  {6:6.2f}  {7:6.2f}  {8:6.2f}  '
+                  '{9:6.1%}'.format(*row, high, m_high))
+    return np.array(rows, float)
 
 
-def galaxy_part(args, psf):
+def galaxy_part(args, optics):
+    rows = []
     for index in (1.0, 4.0):
         truth = light.even_stars(args.size, args.seeds[0], 0.02)
         shape = args.size, args.size
         scene = light.expose(
-            light.draw(psf, truth, shape) + light.sersic(
-                args.size, index=index), truth, args.seeds[0]).bounded(psf)
-        print_galaxy(f'galaxy of n = {index:.0f}', scene, *reduce(psf, scene))
+            optics.draw(truth, shape) + light.sersic(
+                args.size, index=index), truth, args.seeds[0]).bounded(
+                    optics.psf)
+        rows.append(print_galaxy(f'galaxy of n = {index:.0f}', scene,
+                                 *reduce(optics.psf, scene)))
+    return rows
 
 
 def print_galaxy(name, scene, table, seconds):
@@ -205,6 +224,7 @@ def print_galaxy(name, scene, table, seconds):
     print(f'\n{name}: {len(table)} stars, {np.mean(~table["star"]):.1%} '
           f'flagged, {seconds:.1f} CPU s\n radius    stars < 23 mag, found  '
           'listed  false  all listed, flux bias')
+    rows = []
     for low, high in ((0, 40), (40, 80), (80, 140), (140, scene.size)):
         here = bright & (radius >= low) & (radius < high)
         near = score.listed & (far >= low) & (far < high)
@@ -217,6 +237,8 @@ def print_galaxy(name, scene, table, seconds):
         print(f'{low:3d}-{high:3d} {here.sum():6d}  {found[here].mean():7.1%}'
               f'   {near.sum():5d}  {score.false[near].mean():6.1%}  '
               f'{also.sum():5d}  {bias:+.4f}')
+        rows.append((low, found[here].mean(), score.false[near].mean()))
+    return np.array(rows)
 
 
 def main():
@@ -227,11 +249,11 @@ def main():
     parser.add_argument('--size', type=int, default=512)
     parser.add_argument('--seeds', type=int, nargs=2, default=(1, 2))
     args = parser.parse_args()
-    psf = light.make_psf(args.size, args.seeds[0])
+    optics = light.Optics.of(args.size, args.seeds[0])
     parts = {'even': even_part, 'plane': plane_part, 'cluster': cluster_part,
              'galaxy': galaxy_part}
     for part in args.parts:
-        parts[part](args, psf)
+        parts[part](args, optics)
 
 
 if __name__ == '__main__':

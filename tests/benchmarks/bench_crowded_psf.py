@@ -89,6 +89,21 @@ def print_both(own, true):
               f'{b[3]:5.2%} | {a[4]:+.4f} {b[4]:+.4f}')
 
 
+def compare(scene, psf):
+    """Print how good a scene is measured; return both lists' scores."""
+    true, seconds = measure(scene, psf)
+    print(f'true PSF: {len(true.table)} stars, {seconds:.1f} CPU s')
+    start = time.process_time()
+    images = scene.images
+    field = fit_crowded_psf(images['sci'], error=images['err'],
+                            mask=images['mask'])
+    print(f'{field}: {time.process_time() - start:.1f} CPU s')
+    own, seconds = measure(scene, field.to_grid(1 + 4 * field.degree))
+    print(f'own PSF: {len(own.table)} stars, {seconds:.1f} CPU s')
+    print_both(own, true)
+    return own, true
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
     parser.add_argument('scene', nargs='?')
@@ -104,16 +119,7 @@ def main():
         psf = GriddedMixturePSF.read(args.psf)
     else:
         parser.error('give SCENE and TRUE_PSF, or --simulate')
-    true, seconds = measure(scene, psf)
-    print(f'true PSF: {len(true.table)} stars, {seconds:.1f} CPU s')
-    start = time.process_time()
-    images = scene.images
-    field = fit_crowded_psf(images['sci'], error=images['err'],
-                            mask=images['mask'])
-    print(f'{field}: {time.process_time() - start:.1f} CPU s')
-    own, seconds = measure(scene, field.to_grid(1 + 4 * field.degree))
-    print(f'own PSF: {len(own.table)} stars, {seconds:.1f} CPU s')
-    print_both(own, true)
+    compare(scene, psf)
 
 
 if __name__ == '__main__':

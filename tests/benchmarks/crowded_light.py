@@ -1,9 +1,12 @@
 """Crowded scenes with other light than that of stars spread evenly."""
-from dataclasses import replace
+import sys
+from dataclasses import dataclass, replace
 
 import numpy as np
+from astropy.nddata import NDData
 from astropy.table import Table
 from crowded_scores import Scene
+from photutils.psf import GriddedPSFModel
 from scipy.ndimage import binary_dilation
 from scipy.special import gammaincinv
 
@@ -14,17 +17,56 @@ from photutils_mgauss.simulation import crowded_field, csst_psf
 ZERO, SKY, READ_NOISE, FULL_WELL = 31.24, 20.2, 5.0, 9e4
 
 
-def make_psf(size, seed):
-    """Return a PSF with the pixel in it, from that of a mock camera."""
-    optics = csst_psf((size, size), n_nodes=4, rng=seed)
-    return GriddedMixturePSF.from_gridded_psf(
-        optics.to_gridded_psf(2, radius=20), 5)
+@dataclass(frozen=True)
+class Optics:
+    """What draws stars, and the PSF that is given to the solver."""
+
+    psf: GriddedMixturePSF
+
+    @classmethod
+    def of(cls, size, seed):
+        """Return those of a mock camera, drawn with their mixtures."""
+        optics = csst_psf((size, size), n_nodes=4, rng=seed)
+        return cls(GriddedMixturePSF.from_gridded_psf(
+            optics.to_gridded_psf(2, radius=20), 5))
+
+    def draw(self, truth, shape):
+        """Return the light of stars without noise."""
+        stars = np.array([truth[name] for name in ('x', 'y', 'flux')], float)
+        return MixtureRenderer(self.psf).image(stars, 1e-3, shape)
 
 
-def draw(psf, truth, shape):
-    """Return the light of stars without noise."""
-    stars = np.array([truth[name] for name in ('x', 'y', 'flux')], float)
-    return MixtureRenderer(psf).image(stars, 1e-3, shape)
+@dataclass(frozen=True)
+class HarnessOptics(Optics):
+    """Optics of another simulator; the solver gets mixtures fitted to them."""
+
+    table: object
+    origin = (512, 512)
+
+    @classmethod
+    def of(cls, size, harness, file):
+        """Return those of a file of the simulator in a folder."""
+        sys.path.insert(0, str(harness))
+        from csst_psf import TruePSF
+        table = TruePSF(file)
+        nodes = np.linspace(0, size - 1, 7)
+        places = [(x, y) for y in nodes for x in nodes]
+        data = np.array([table.epsf(*np.add(place, cls.origin), 2, 61)
+                         for place in places])
+        return cls(GriddedMixturePSF.from_gridded_psf(GriddedPSFModel(NDData(
+            data, meta={'grid_xypos': places, 'oversampling': 2})), 6,
+            radius=14), table)
+
+    def draw(self, truth, shape, reach=None):
+        """Return the light of stars without noise, as far as the table."""
+        from csst_scene import stamp_radius
+        image = np.zeros(shape)
+        x, y, flux = (np.array(truth[name], float)
+                      for name in ('x', 'y', 'flux'))
+        if reach is None:
+            reach = stamp_radius(ZERO - 2.5 * np.log10(flux))
+        self.table.render(image, x, y, flux, reach, self.origin)
+        return image
 
 
 def expose(light, truth, seed):

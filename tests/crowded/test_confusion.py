@@ -1,7 +1,9 @@
 """Errors and fluxes that allow for stars that were not found."""
 import numpy as np
 import pytest
+from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import Table
+from astropy.wcs import WCS
 
 from photutils_mgauss import (
     CrowdedMixturePhotometry,
@@ -190,3 +192,30 @@ def test_a_complete_list_hides_nothing():
     assert known.mean() > 0.9
     assert (table['x_confusion_err'][known] == 0).all()
     assert (table['flux_confusion'] == 0).all()
+
+
+def test_fluxes_in_many_images_know_of_hidden_stars_too():
+    _, error, stars = scene(200, 1 / 16, 4)
+    light = MixtureRenderer(PSF).image(stars, 1e-3, error.shape) + SKY
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.cdelt = ('RA---TAN', 'DEC--TAN'), (-1e-5, 1e-5)
+    wcs.wcs.crpix = 100, 100
+    rng = np.random.default_rng(9)
+    images = [(NDData(rng.normal(light, error), StdDevUncertainty(error)),
+               PSF, wcs) for _ in range(3)]
+    found = []
+    for confusion in (True, False):
+        table = CrowdedMixturePhotometry(
+            None, confusion=confusion).fit_images(images)
+        bright = stars[:, stars[2] > 1e3]
+        row = match(bright, (table['x_fit'][:, 0].value,
+                             table['y_fit'][:, 0].value,
+                             np.asarray(table['flux'][:, 0])),
+                    (np.empty(0),) * 3, 0.5, 2.0)
+        true, row = bright[2, row >= 0, None], row[row >= 0]
+        found.append((np.asarray(table['flux'])[row] - true)
+                     / np.asarray(table['flux_err'])[row])
+        assert ('flux_confusion' in table.colnames) == confusion
+    new, old = (scatter(pull - np.median(pull)) for pull in found)
+    assert 0.8 < new < 1.25 < old
+    assert abs(np.median(found[0])) < abs(np.median(found[1]))

@@ -140,3 +140,28 @@ def test_the_crowded_solver_masks_and_fits_them_too(sky_scene):
         assert table['flags'][best] & 65536
         assert table['flux_fit'][best] == pytest.approx(stars[k, 2],
                                                         rel=0.02)
+
+
+def test_wings_are_measured_on_the_image_where_the_psf_is_wrong():
+    rng = np.random.default_rng(11)
+    ghost = GaussianMixture([0.69, 0.295, 0.015],
+                            [(0, 0), (0, 0), (5.5, 1)],
+                            [*MIXTURE.covariances, [[1.2, 0], [0, 1.2]]])
+    y, x = (v.ravel() + rng.uniform(-0.5, 0.5, v.size)
+            for v in np.mgrid[20:300:28, 20:300:28])
+    saturated = np.arange(x.size) % 7 == 3
+    flux = FULL / PEAK * np.where(saturated, 6.0,
+                                  rng.uniform(0.2, 0.8, x.size))
+    light = sum(ghost.render((310, 310), *star, flux=f)
+                for *star, f in zip(x, y, flux, strict=True))
+    data = np.minimum(rng.normal(light, np.sqrt(light + SKY)), FULL)
+    phot = MixturePSFPhotometry(PSF, 9, saturation=FULL - 100)
+    table = phot(data, error=np.sqrt(light + SKY),
+                 init_params=QTable({'x': x, 'y': y, 'flux': flux}))
+    error = np.array([table['x_fit'] - x, table['y_fit'] - y])[:, saturated]
+    # By the PSF alone they are off by 0.18 pixels in x, up to 9 % in flux.
+    assert np.sqrt(np.mean(error**2)) < 0.02
+    assert (np.abs(table['flux_fit'] / flux - 1)[saturated] < 0.04).all()
+    pull = np.concatenate([error[0] / table['x_err'][saturated],
+                           error[1] / table['y_err'][saturated]])
+    assert np.sqrt(np.mean(pull**2)) < 1.5
