@@ -4,6 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
+
+# As many processes run tests as there are cores: more threads of linear
+# algebra would wait for each other, here and in processes that tests start.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+threadpool_limits(1, user_api='blas')
 
 REALDATA = Path(os.environ.get(
     'MGAUSS_REALDATA',

@@ -61,10 +61,98 @@ def test_a_table_is_measured_again_when_it_must_be(store, tmp_path, options):
 
 def test_only_a_number_within_the_printed_one_is_called_reached(store):
     below = store.Comparison.below
-    assert below('error', 0.86, 0.5, why='noise').verdict == 'reached'
-    assert below('error', 0.86, 0.9, why='noise').verdict == 'worse: noise'
+    assert below('error', 0.86, 0.5, why='noise',
+                 full=True).verdict == 'reached'
+    assert below('error', 0.86, 0.9, why='noise',
+                 full=True).verdict == 'worse: noise'
     assert below('error', 0.86, np.nan, why='noise').verdict.startswith(
         'worse')
+
+
+def test_only_the_method_and_the_size_of_the_paper_are_called_reached(store):
+    below = store.Comparison.below
+    assert below('error', 0.86, 0.5).verdict == 'better, in a smaller field'
+    assert below('error', 0.86, 0.5, full=True,
+                 method=False).verdict == 'better by another method'
+
+
+@pytest.mark.usefixtures('store')
+def test_detectors_have_the_bands_and_places_that_are_known():
+    import settings
+
+    from photutils_mgauss import CSST_BANDS, paper_exposures
+    counts = {band: list(settings.BANDS.values()).count(band)
+              for band in CSST_BANDS}
+    assert counts == {'NUV': 4, 'y': 4, 'u': 2, 'g': 2, 'r': 2, 'i': 2,
+                      'z': 2}
+    for exposure in paper_exposures():
+        assert settings.BANDS[exposure.detector] == exposure.band.name
+    places = [settings.place_of(number) for number in settings.BANDS]
+    # Eighteen places in four columns of five, the corners are spectrographs'.
+    assert len(set(places)) == 18
+    assert {row for row, _ in places} == set(range(5))
+    assert {column for _, column in places} == {1, 2, 3, 4}
+    assert settings.place_of(10)[1] == 4
+    assert not {10, 21} & set(settings.BANDS)
+
+
+@pytest.mark.usefixtures('store')
+def test_all_effects_of_the_paper_are_on():
+    from settings import effects
+    found = effects()
+    for name in ('prnu', 'hot_pixels', 'warm_pixels', 'dead_pixels',
+                 'bad_columns', 'cosmic_rays', 'nonlinearity', 'bleeding',
+                 'charge_diffusion', 'large_scale_flat', 'flat_error',
+                 'shutter'):
+        assert getattr(found, name) > 0
+
+
+def test_a_step_that_finds_everything_keeps_its_first_cost(store, tmp_path):
+    run = make_run(store, tmp_path)
+    with run.step('one'):
+        run.table('one', lambda: table_of(sum(range(2_000_000))))
+    first = run.costs()
+    with run.step('one'):
+        run.table('one', lambda: table_of(2.0))
+    assert run.costs() == first
+    assert first['one'][0] > 0
+
+
+def test_seeds_do_not_share_tables(store, tmp_path):
+    make_run(store, tmp_path).table('one', lambda: table_of(1.0))
+    other = make_run(store, tmp_path, seed=1)
+    assert other.table('one', lambda: table_of(2.0))['value'][0] == 2
+
+
+@pytest.mark.usefixtures('store')
+def test_a_full_run_is_as_much_work_as_a_full_run():
+    import reproduce
+    import settings
+    from summary import full_work
+    for group in reproduce.GROUPS:
+        assert full_work(group.name, settings.FULL) == pytest.approx(1)
+        assert full_work(group.name, settings.HALF) >= 1
+
+
+@pytest.mark.usefixtures('store')
+def test_the_page_puts_the_second_seed_beside_the_first(store):
+    from summary import _table
+    lines = [store.Comparison('error', '1 mas', '0.5 mas', 'better')]
+    again = [store.Comparison('error', '1 mas', '0.6 mas', 'better')]
+    text = ' '.join(_table(lines, [again]))
+    assert text.index('0.5 mas') < text.index('0.6 mas')
+
+
+@pytest.mark.usefixtures('store')
+def test_sources_are_the_same_only_where_they_are_close_both_ways():
+    from astropy.coordinates import SkyCoord
+    from sky_figures import _same
+    true = SkyCoord([10.0, 10.001], [0.0, 0.0], unit='deg')
+    found = SkyCoord(10 + np.array([0.04, 0.1, 3.0, 3.7]) / 3600,
+                     np.zeros(4), unit='deg')
+    i, j = _same(found, true)
+    assert sorted(zip(i.tolist(), j.tolist(), strict=True)) == [(0, 0),
+                                                               (3, 1)]
 
 
 def test_the_spread_of_normal_numbers_is_their_width(store):

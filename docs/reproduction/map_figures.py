@@ -1,13 +1,11 @@
 """Size and ellipticity over the detectors: Figs. 4 to 7."""
-from contextlib import suppress
-
 import numpy as np
 from astropy.table import QTable, vstack
-from matplotlib.figure import Figure as Canvas
 from peers import AbsentError, absent, psfex
 from scenes import detector, forget
-from settings import BANDS
+from settings import TABLE_2_DETECTORS, place_of
 from store import Comparison, Figure, Group
+from styles import canvas_of
 
 from photutils_mgauss import assess_psf
 
@@ -70,10 +68,13 @@ def _pairs(run, one):
              'field': (one.field, one.true_image, False),
              'chain_truth': (one.chain, one.true_image, False)}
     # PSFEx takes longer than everything else together.
-    if one.number in BANDS:
-        with suppress(AbsentError):
-            path = run.folder / 'partial' / f'{one.number:02d}.psf'
-            model = psfex(one.sparse.image, run.settings.degree, path)
+    if one.number in TABLE_2_DETECTORS:
+        path = run.folder / 'partial' / f'{one.number:02d}.psf'
+        try:
+            model = psfex(one.sparse, run.settings.degree, path)
+        except AbsentError as error:
+            run.skipped[f'PSFEx on detector {one.number}'] = str(error)
+        else:
             pairs['psfex'] = (model.image_at, one.true_image, False)
     return pairs
 
@@ -98,28 +99,36 @@ def draw(name, error, tables):
     """Draw one map for each detector, with the same colours."""
     maps = tables['maps']
     numbers = np.unique(maps['detector'])
-    columns = min(6, len(numbers))
-    rows = -(-len(numbers) // columns)
-    canvas = Canvas(figsize=(2 * columns + 1.2, 2.1 * rows + 0.6),
-                    layout='constrained')
-    axes = np.ravel(canvas.subplots(rows, columns, squeeze=False))
+    canvas = canvas_of(6.6)
+    # The columns of the focal plane that hold imaging detectors.
+    axes = canvas.subplots(5, 4)
     limit = np.nanpercentile(np.abs(maps[f'{name}_{error}']), 98)
-    for ax, number in zip(axes, numbers, strict=False):
-        part = maps[maps['detector'] == number]
-        values = np.asarray(part[f'{name}_{error}'])
-        side = int(np.sqrt(len(values)))
-        shown = ax.imshow(values.reshape(side, side), origin='lower',
-                          cmap='RdBu_r', vmin=-limit, vmax=limit)
-        ax.set(xticks=[], yticks=[])
-        ax.set_title(f'#{number:02d} {part["band"][0]}: '
-                     f'{np.nanmedian(values):+.4f} $\\pm$ '
-                     f'{np.nanstd(values):.4f}', fontsize=7)
-    for ax in axes[len(numbers):]:
+    for ax in axes.flat:
         ax.set_axis_off()
-    canvas.colorbar(shown, ax=list(axes), label=ERRORS[error])
-    canvas.supxlabel('x of the detector', fontsize=9)
-    canvas.supylabel('y of the detector', fontsize=9)
+    for number in numbers:
+        part = maps[maps['detector'] == number]
+        row, column = place_of(int(number))
+        shown = _panel(axes[row, column - 1], part, f'{name}_{error}', limit)
+    bar = canvas.colorbar(shown, ax=axes, label=ERRORS[error], shrink=0.7,
+                          extend='both')
+    bar.ax.tick_params(direction='out')
     return canvas
+
+
+def _panel(ax, part, name, limit):
+    """Draw the map of one detector."""
+    values = np.asarray(part[name])
+    side = int(np.sqrt(len(values)))
+    ax.set_axis_on()
+    shown = ax.imshow(values.reshape(side, side), origin='lower',
+                      cmap='RdBu_r', vmin=-limit, vmax=limit,
+                      extent=(0, 9216, 0, 9216))
+    ax.set(xticks=[0, 9216], yticks=[0, 9216])
+    ax.tick_params(labelsize=5, direction='out', top=False, right=False)
+    ax.set_title(f'#{part["detector"][0]:02d} {part["band"][0]}: '
+                 f'{np.nanmedian(values):+.4f} $\\pm$ '
+                 f'{np.nanstd(values):.4f}', fontsize=6.5)
+    return shown
 
 
 def compare(names, error, tables):
@@ -154,7 +163,9 @@ def _figure(key, error, name, others, text):
         key, title,
         'The sign is that of the paper, truth minus model; titles give the '
         'median and the standard deviation over the places of a detector. '
-        'The colours of all panels are the same. PSFEx is run on the '
+        'The colours of all panels are the same, their places are those of '
+        'the detectors on the focal plane, and axes are pixels of a whole '
+        'detector. PSFEx is run on the '
         'detectors of Table 2, where it chooses its own stars, as many as '
         'it likes.',
         lambda tables: draw(name, error, tables),

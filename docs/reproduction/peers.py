@@ -31,7 +31,7 @@ _FILTER = ('CONV NORM\n1 2 1\n2 4 2\n1 2 1\n')
 
 
 class AbsentError(RuntimeError):
-    """A program is not installed."""
+    """A program is not installed, or does not do its work."""
 
 
 def absent(name):
@@ -78,10 +78,12 @@ def _crowdsource_version(python):
     return result.stdout.strip() if result.returncode == 0 else None
 
 
-def sextractor(image, *, psf=None, threshold=1.5, vignettes=None,
+def sextractor(scene, *, psf=None, threshold=1.5, vignettes=None,
                contrast=1e-4):
     """
-    Run SExtractor; with ``vignettes``, a path, write what PSFEx reads.
+    Run SExtractor on an image, with weights that are 0 where a pixel is bad.
+
+    With ``vignettes``, a path, write what PSFEx reads.
 
     Returns a table with the columns of SExtractor, pixels counted from 1.
     """
@@ -93,7 +95,9 @@ def sextractor(image, *, psf=None, threshold=1.5, vignettes=None,
         columns += ['VIGNET(31,31)']
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        fits.writeto(folder / 'image.fits', image.astype('f4'))
+        fits.writeto(folder / 'image.fits', scene.image.astype('f4'))
+        # The noise of the sky alone: SExtractor adds that of stars.
+        fits.writeto(folder / 'weight.fits', (~scene.mask).astype('f4'))
         (folder / 'columns').write_text('\n'.join(columns) + '\n')
         (folder / 'filter').write_text(_FILTER)
         options = {
@@ -102,6 +106,7 @@ def sextractor(image, *, psf=None, threshold=1.5, vignettes=None,
             'DETECT_MINAREA': 3, 'DETECT_THRESH': threshold,
             'ANALYSIS_THRESH': threshold, 'DEBLEND_NTHRESH': 64,
             'DEBLEND_MINCONT': contrast, 'CLEAN': 'N', 'GAIN': 1.0,
+            'WEIGHT_TYPE': 'MAP_WEIGHT', 'WEIGHT_IMAGE': 'weight.fits',
             'PHOT_APERTURES': 20, 'SATUR_LEVEL': 85000,
             'PIXEL_SCALE': 0.074, 'SEEING_FWHM': 0.14, 'BACK_SIZE': 64,
             'MEMORY_OBJSTACK': 60000, 'MEMORY_PIXSTACK': 6000000,
@@ -119,18 +124,21 @@ def _call(program, folder, target, options):
              for word in (f'-{key}', value)]
     # No file of settings but these: the program's own defaults for the rest.
     (folder / 'none').write_text('')
-    subprocess.run([program, target, '-c', 'none', *words], cwd=folder,
-                   check=True, capture_output=True)
+    done = subprocess.run([program, target, '-c', 'none', *words], text=True,
+                          cwd=folder, check=False, capture_output=True)
+    if done.returncode:
+        msg = f'{Path(program).name} ended with: {done.stderr.strip()[-300:]}'
+        raise AbsentError(msg)
 
 
-def psfex(image, degree, path):
-    """Make a PSFEx model, written to a path, from the stars of an image."""
+def psfex(scene, degree, path):
+    """Make a PSFEx model, written to a path, from the stars of a scene."""
     program = _program('PSFEx', 'psfex')
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        sextractor(image, vignettes=folder / 'stars.cat')
+        sextractor(scene, vignettes=folder / 'stars.cat')
         _call(program, folder, 'stars.cat', {
             'BASIS_TYPE': 'PIXEL', 'PSF_SAMPLING': 0.5, 'PSF_SIZE': '51,51',
             'PSF_RECENTER': 'Y', 'CENTER_KEYS': 'XWIN_IMAGE,YWIN_IMAGE',

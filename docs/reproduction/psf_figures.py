@@ -1,10 +1,10 @@
 """The PSF, its Gaussians, their posterior: Figs. 1-3, Appendices A, B."""
 import numpy as np
 from astropy.table import QTable
-from matplotlib.figure import Figure as Canvas
 from scenes import detector
 from settings import PIXEL, STAMP_RADIUS
-from store import COLOURS, Comparison, Figure, Group
+from store import Comparison, Figure, Group
+from styles import COLOURS, canvas_of
 
 from photutils_mgauss import (
     MixturePosterior,
@@ -77,17 +77,19 @@ def draw_image(tables):
     image = np.asarray(tables['image']['sample'])
     steps = (np.arange(len(image)) - len(image) // 2) / 2
     inner = np.hypot(steps, steps[:, None]) <= STAMP_RADIUS
-    canvas = Canvas(figsize=(9, 6), layout='constrained')
+    canvas = canvas_of(4.6)
     axes = canvas.subplots(2, 2, sharex=True)
     for column, (shown, name) in enumerate((
             (image, 'whole'), (np.where(inner, image, 0), 'within 1.1"'))):
         for row, axis in enumerate('xy'):
             ax = axes[row, column]
             values = shown.sum(axis=row) / image.sum()
-            ax.fill_between(steps * PIXEL, values, step='mid',
-                            color=COLOURS[row])
+            ax.step(steps * PIXEL, np.where(values > 0, values, np.nan),
+                    where='mid', color=COLOURS[row])
+            top = values.max()
             ax.set(xlabel=f'{axis} [arcsec]', ylabel='share of the flux',
-                   title=f'{name}, projected on {axis}')
+                   title=f'{name}, projected on {axis}', yscale='log',
+                   ylim=(top / 1e4, 2 * top))
     return canvas
 
 
@@ -100,7 +102,7 @@ def compare_image(tables):
 
 def draw_graph(tables):
     """Draw Fig. 2: the Bayesian model."""
-    canvas = Canvas(figsize=(9, 3.5), layout='constrained')
+    canvas = canvas_of(2.8)
     side = len(cut(tables['image']['sample']))
     plot_model_graph(3, (side, side), ax=canvas.subplots())
     return canvas
@@ -110,11 +112,14 @@ def draw_components(tables):
     """Draw Fig. 3: the profile and its Gaussians, linear and logarithmic."""
     stamp = cut(tables['image']['sample'])
     fit = fit_mixture(stamp, 3, **FIT)
-    canvas = Canvas(figsize=(9, 7.5), layout='constrained')
+    canvas = canvas_of(6.0)
     axes = canvas.subplots(2, 2)
     for ax, axis in zip(axes[0], 'xy', strict=True):
         plot_projection(fit, stamp, axis=axis, oversampling=2, ax=ax)
+        top = ax.get_ylim()[1]
+        ax.set(yscale='log', ylim=(top / 1e4, 2 * top))
     plot_profile(fit, stamp, ax=axes[1, 0])
+    axes[1, 0].set_ylim(1e-4, 2)
     plot_ellipses(fit.mixture, ax=axes[1, 1])
     axes[0, 0].set_title('(a) projection on x')
     axes[0, 1].set_title('(a) projection on y')
@@ -136,7 +141,7 @@ def draw_numbers(tables):
     """Draw Appendix B: residuals for one, three and five Gaussians."""
     stamp = cut(tables['image']['sample'])
     table = compare_n_components(stamp, (1, 3, 5), **FIT)
-    canvas = Canvas(figsize=(11, 3.2), layout='constrained')
+    canvas = canvas_of(2.1)
     plot_comparison_of_numbers(stamp, table, axes=canvas.subplots(1, 4))
     return canvas
 
@@ -190,7 +195,7 @@ def draw_posterior(tables):
     draws = {name: np.moveaxis(np.asarray(tables['draws'][name]), 0, 1)
              for name in (*PARAMETERS, 'flux')}
     posterior = MixturePosterior(**draws, fit=None, idata=None)
-    canvas = Canvas(figsize=(11, 14), layout='constrained')
+    canvas = canvas_of(9.0)
     for name, (left, right) in zip(PARAMETERS, canvas.subplots(5, 2),
                                    strict=True):
         left.set_prop_cycle(color=COLOURS)
@@ -238,5 +243,5 @@ GROUPS = (
                'Draws of ``sample_mixture`` with the priors of the paper: '
                'distributions on the left, traces of two chains on the '
                'right. Lengths are in pixels from the centre of the stamp.',
-               draw_posterior, compare_posterior),)),
+               draw_posterior, compare_posterior),), random=False),
 )

@@ -6,7 +6,7 @@ import numpy as np
 from photutils.background import Background2D
 from photutils.detection import DAOStarFinder
 from scipy.spatial import cKDTree
-from settings import BANDS, STAMP_RADIUS
+from settings import BANDS, STAMP_RADIUS, TABLE_2_DETECTORS, effects
 from store import Run, spread
 
 from photutils_mgauss import (
@@ -49,7 +49,7 @@ class Detector:
     @property
     def band(self):
         """The name of the filter."""
-        return BANDS.get(self.number, 'g')
+        return BANDS[self.number]
 
     @property
     def name(self):
@@ -57,14 +57,20 @@ class Detector:
         return f'#{self.number:02d} {self.band}'
 
     @cached_property
-    def truth(self):
-        """The PSF that stars are drawn with."""
+    def light(self):
+        """The PSF before the detector spreads the charge."""
         shape = (self.size, self.size)
+        seed = 1000 * self.run.seed + self.number
         if self.run.optics == 'mixtures':
-            return csst_psf(shape, self.band, rng=self.number)
+            return csst_psf(shape, self.band, rng=seed)
         samples, nodes = self.run.settings.optics
-        optics = Optics(shape, self.band, rng=self.number, n_wavelengths=2)
-        return optics.to_gridded_psf(nodes, n_samples=samples, radius=20)
+        optics = Optics(shape, self.band, rng=seed)
+        return optics.to_gridded_psf(nodes, n_samples=samples, radius=24)
+
+    @property
+    def truth(self):
+        """The PSF of faint stars, the spread of charge included."""
+        return self.sparse.psf
 
     def true_image(self, x, y, *, oversampling=2, radius=20):
         """Return the true PSF, its pixel included, around a place."""
@@ -75,12 +81,14 @@ class Detector:
 
     @cached_property
     def sparse(self):
-        """An exposure of isolated stars."""
-        stars = sparse_field((self.size, self.size), spacing=40,
-                             rng=100 + self.number)
-        return simulate(stars, Exposure(band=self.band), psf=self.truth,
-                        instrument=Instrument(shape=(self.size, self.size)),
-                        rng=200 + self.number)
+        """An exposure of isolated stars, with all effects."""
+        seed = 1000 * self.run.seed + self.number
+        stars = sparse_field((self.size, self.size),
+                             spacing=self.run.settings.spacing,
+                             rng=100_000 + seed)
+        return simulate(stars, Exposure(band=self.band, detector=self.number),
+                        psf=self.light, effects=effects(), rng=200_000 + seed,
+                        instrument=Instrument(shape=(self.size, self.size)))
 
     @cached_property
     def psf_stars(self):
@@ -127,15 +135,16 @@ _made = {}
 
 def detector(run, number, size=None):
     """Return a detector, made once for each number and size."""
-    key = (run.fingerprint, number, size or run.settings.size)
+    key = (run.fingerprint, number, size or run.settings.size, run.seed)
     if key not in _made:
         _made[key] = Detector(run, number, key[2])
     return _made[key]
 
 
 def forget(size):
-    """Free the memory of the detectors of a size, number 8 excepted."""
-    for key in [key for key in _made if key[1] != 8 and key[2] == size]:
+    """Free the memory of the detectors of a size but those of Table 2."""
+    for key in [key for key in _made if key[2] == size
+                and key[1] not in TABLE_2_DETECTORS]:
         del _made[key]
 
 
@@ -162,7 +171,10 @@ def catalogue(scene, psf):
     photometry = MixturePSFPhotometry(psf, FIT_SHAPE, finder=finder,
                                       aperture_radius=3, effective_gain=1)
     table = photometry(data, error=noise, mask=scene.mask)
-    return table[table['flags'] == 0]
+    # A few masked pixels in a star's window (flag 1) do not spoil its fit.
+    whole = FIT_SHAPE[0] * FIT_SHAPE[1]
+    return table[((table['flags'] & ~1) == 0)
+                 & (table['n_pixels_fit'] > 0.8 * whole)]
 
 
 def match(table, truth, limit=1.0):
@@ -180,25 +192,6 @@ def cubic(x, y, size):
     u, v = (2 * np.asarray(a, float) / size - 1 for a in (x, y))
     return np.column_stack([u**i * v**j for i in range(4)
                             for j in range(4 - i)])
-
-
-def calibration(detector, psf):
-    """
-    Return the coefficients (10, 2) of a PSF model's distortion.
-
-    A model has its own convention of where the centre of a star is, smooth
-    over the detector. It is measured with the bright stars of the sparse
-    exposure, whose places a catalogue would tell.
-    """
-    scene = detector.sparse
-    table = catalogue(scene, psf)
-    i, j = match(table, scene.truth)
-    bright = scene.truth['mag'].value[j] < 21.5
-    i, j = i[bright], j[bright]
-    shift = np.column_stack([table[f'{c}_fit'][i] - scene.truth[c][j].value
-                             for c in 'xy'])
-    terms = cubic(table['x_fit'][i], table['y_fit'][i], detector.size)
-    return robust_fit(terms, shift)
 
 
 def robust_fit(terms, values):

@@ -1,6 +1,9 @@
 """Tables and figures in a folder, each made once for the same settings."""
 import datetime as dt
 import platform
+import resource
+import time
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from itertools import pairwise
@@ -8,11 +11,6 @@ from pathlib import Path
 
 import numpy as np
 from astropy.table import QTable, Table
-
-# The colours of Okabe and Ito, and marks that differ as well.
-COLOURS = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#D55E00', '#56B4E9',
-           '#000000', '#999999', '#F0E442')
-MARKS = 'os^Dv*Pxh'
 
 PACKAGES = ('photutils_mgauss', 'numpy', 'scipy', 'numba', 'astropy',
             'photutils', 'gwcs', 'pymc', 'matplotlib', 'galsim', 'sep')
@@ -35,8 +33,12 @@ class Run:
         Whether to measure again what is there.
     crowdsource_python : str or None
         An interpreter that has crowdsource.
+    seed : int
+        What is added to all seeds, 0 for the results that are shown.
     skipped : dict
         What was left out, and why; filled on the way.
+    made : list of str
+        The tables that this call has measured; filled on the way.
     """
 
     settings: object
@@ -44,12 +46,14 @@ class Run:
     folder: Path
     redo: bool = False
     crowdsource_python: str | None = None
+    seed: int = 0
     skipped: dict = field(default_factory=dict)
+    made: list = field(default_factory=list)
 
     @property
     def fingerprint(self):
         """What a stored table must have been made with to be used again."""
-        return f'{self.settings}, optics={self.optics!r}'
+        return f'{self.settings}, optics={self.optics!r}, seed={self.seed}'
 
     def table(self, name, function, *, keep=True):
         """Return a stored table, or measure and store it."""
@@ -58,6 +62,7 @@ class Run:
             found = QTable.read(path)
             if found.meta.get('settings') == self.fingerprint:
                 return found
+        self.made.append(name)
         # What is measured again from must keep all its digits.
         table = _rounded(function()) if keep else QTable(function())
         table.meta |= {'settings': self.fingerprint, **provenance()}
@@ -66,10 +71,40 @@ class Run:
         return table
 
     def figure(self, name, figure):
-        """Store a figure."""
-        path = self.folder / 'figures' / f'{name}.png'
+        """Store a figure as vectors, in the two formats that journals take."""
+        for kind, none in (('svg', 'Date'), ('pdf', 'CreationDate')):
+            path = self.folder / 'figures' / f'{name}.{kind}'
+            path.parent.mkdir(parents=True, exist_ok=True)
+            figure.savefig(path, metadata={none: None})
+
+    @contextmanager
+    def step(self, name):
+        """Note what a step costs, unless everything was there already."""
+        before = len(self.made), time.perf_counter(), _cpu_seconds()
+        yield
+        if len(self.made) == before[0]:
+            return
+        cost = QTable({'step': [name], 'seed': [self.seed],
+                       'wall': [time.perf_counter() - before[1]],
+                       'cpu': [_cpu_seconds() - before[2]]})
+        path = self.folder / 'partial' / f'cost_{name}.ecsv'
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=80)
+        cost.write(path, overwrite=True)
+
+    def costs(self):
+        """Return wall and CPU time [s] by the name of the step."""
+        found = {}
+        for path in (self.folder / 'partial').glob('cost_*.ecsv'):
+            row = QTable.read(path)[0]
+            found[row['step']] = float(row['wall']), float(row['cpu'])
+        return found
+
+
+def _cpu_seconds():
+    """Return the CPU time of this process and of the programs it ran."""
+    return sum(used.ru_utime + used.ru_stime for used in (
+        resource.getrusage(resource.RUSAGE_SELF),
+        resource.getrusage(resource.RUSAGE_CHILDREN)))
 
 
 def _rounded(table):
@@ -108,7 +143,19 @@ def versions():
 
 @dataclass(frozen=True)
 class Comparison:
-    """A number of ours beside the one that is printed, in words."""
+    """
+    A number of ours beside the one that is printed.
+
+    Attributes
+    ----------
+    quantity : str
+        What is compared. It has no measured number in it, so that it is the
+        same for each seed.
+    printed, ours : str
+        The number of the paper, and ours in the paper's definition.
+    verdict : str
+        What to think of it.
+    """
 
     quantity: str
     printed: str
@@ -116,11 +163,26 @@ class Comparison:
     verdict: str = ''
 
     @classmethod
-    def below(cls, quantity, printed, value, *, unit='', why=''):
-        """Compare a number that should not exceed the printed one."""
-        verdict = 'reached' if value <= printed else f'worse: {why}'
+    def below(cls, quantity, printed, value, *, unit='', why='', method=True,
+              full=False):
+        """
+        Compare a number that should not exceed the printed one.
+
+        It is called reached only where method and conditions are those of
+        the paper.
+        """
         return cls(quantity, f'{printed:g} {unit}'.strip(),
-                   f'{value:.2f} {unit}'.strip(), verdict)
+                   f'{value:.2f} {unit}'.strip(),
+                   judged(value <= printed, why, method=method, full=full))
+
+
+def judged(good, why, *, method, full):
+    """Return the word for a comparison with the paper."""
+    if not good:
+        return f'worse: {why}' if why else 'worse'
+    if not method:
+        return 'better by another method'
+    return 'reached' if full else 'better, in a smaller field'
 
 
 @dataclass(frozen=True)
@@ -149,11 +211,16 @@ class Figure:
 
 @dataclass(frozen=True)
 class Group:
-    """Figures that are drawn from the same measurement."""
+    """
+    Figures that are drawn from the same measurement.
+
+    ``random`` tells whether another seed changes it.
+    """
 
     name: str
     measure: object
     figures: tuple
+    random: bool = True
 
 
 def binned(magnitude, edges):

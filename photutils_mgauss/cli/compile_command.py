@@ -41,16 +41,16 @@ def examples():
 
     psf, data, error, stars = _scene(package)
     stamp = psf.mixture_at(20, 20).render((15, 15), 7, 7)
-    integrated = package.GriddedMixturePSF(
+    integrated, matched = (package.GriddedMixturePSF(
         psf.mixtures, psf.grid_xypos, pixel_integrated=True,
-        interpolation='components')
+        interpolation=how) for how in ('blend', 'components'))
     yield 'photometry', lambda: [
         package.MixturePSFPhotometry(one, (5, 5), aperture_radius=3)(
             data, error=error, init_params=stars, mask=error < 0)
         for one in (psf, integrated)]
     yield 'photometry of several images', lambda: _fit_many(
-        package, psf, data, error)
-    yield 'models and errors', lambda: _use_models(package, psf, integrated,
+        package, (psf, integrated), data, error)
+    yield 'models and errors', lambda: _use_models(package, psf, matched,
                                                    data, error)
     yield 'mixtures of PSF images', lambda: [
         package.fit_mixture(stamp, 2, oversampling=2, weighting=weighting)
@@ -59,11 +59,12 @@ def examples():
         stamp, psf.mixture_at(0, 0))]
     yield 'PSF of stars', lambda: package.fit_mixture_field(
         data, stars, error=error, n_components=1, degree=0)
-    yield 'crowded fields', lambda: package.CrowdedMixturePhotometry(psf)(
-        data, error=error)
+    yield 'crowded fields', lambda: [
+        package.CrowdedMixturePhotometry(one)(data, error=error)
+        for one in (psf, integrated)]
     yield 'crowded fields in many images', lambda: _fit_images(
         package, psf, data, error)
-    yield 'simulated images', lambda: _simulate(package, psf, integrated)
+    yield 'simulated images', lambda: _simulate(package, psf, matched)
 
 
 def _scene(package):
@@ -85,11 +86,12 @@ def _scene(package):
     return psf, data, error, stars
 
 
-def _fit_many(package, psf, data, error):
-    """Fit two stars to an image with a WCS."""
+def _fit_many(package, psfs, data, error):
+    """Fit two stars to an image with a WCS, by each of some PSFs."""
     image, wcs = _on_sky(data, error)
-    package.fit_many([(image, psf, wcs)],
-                     wcs.pixel_to_world([20.3, 40.3], [19.8, 39.8]))
+    for psf in psfs:
+        package.fit_many([(image, psf, wcs)],
+                         wcs.pixel_to_world([20.3, 40.3], [19.8, 39.8]))
 
 
 def _fit_images(package, psf, data, error):
@@ -109,7 +111,7 @@ def _on_sky(data, error):
     return NDData(data, uncertainty=StdDevUncertainty(error)), wcs
 
 
-def _use_models(package, psf, integrated, data, error):
+def _use_models(package, psf, matched, data, error):
     """Evaluate all models, and fit with photutils."""
     import numpy as np
     from astropy.table import QTable
@@ -117,14 +119,14 @@ def _use_models(package, psf, integrated, data, error):
 
     y, x = np.mgrid[:9, :9]
     single = package.MultiGaussianPSFModel(psf.mixtures[0])
-    for model in (psf, integrated, single):
+    for model in (psf, matched, single):
         model.evaluate(x, y, 1.0, 4.0, 4.0)
         model.fit_deriv(x.ravel(), y.ravel(), 1.0, 4.0, 4.0,
                         *model.parameters[3:])
         package.cramer_rao(model, 1e4, 5.0, x=20.0, y=20.0)
     free = single.free_shape()
     free.fit_deriv(x.ravel(), y.ravel(), *free.parameters)
-    for grid in (psf, integrated):
+    for grid in (psf, matched):
         grid.render([3.2], [4.1], 100, 9)
     psf.mixtures[0].gradient(x, y)
     psf.mixtures[0].render((9, 9), 4, 4)
@@ -134,7 +136,7 @@ def _use_models(package, psf, integrated, data, error):
         init_params=QTable({'x': [20.3], 'y': [19.8], 'flux': [5e4]}))
 
 
-def _simulate(package, psf, integrated):
+def _simulate(package, psf, matched):
     """Draw stars with every kind of PSF, and charge that overflows."""
     import numpy as np
 
@@ -142,5 +144,5 @@ def _simulate(package, psf, integrated):
 
     bleed(np.array([[9.0], [1.0]]), 5)
     star = [20.3], [30.1], [1e4]
-    for one in (psf, integrated, psf.to_gridded_psf(radius=5)):
+    for one in (psf, matched, psf.to_gridded_psf(radius=5)):
         package.render_stars(one, *star, (60, 60))

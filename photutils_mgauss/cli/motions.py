@@ -156,7 +156,10 @@ def run(options):
         step('align and fit')
         solution = fitter.fit(epochs)
         step(f'write to {folder}')
-        _collect(solution, names, exposures, options, results)
+        record = tools.record_of(
+            options, notes=list(solution.notes),
+            exposures=[Path(seen[own[0]].image).name for own in exposures])
+        _collect(solution, names, exposures, record, results)
         # Nothing is written before all is well.
         results.deliver()
     tools.say(options, *_summary(solution), f'files are in {folder}')
@@ -437,19 +440,17 @@ def _references(options):
     return table
 
 
-def _collect(solution, names, exposures, options, results):
+def _collect(solution, names, exposures, record, results):
     """Obtain the tables and the WCS."""
     key = results.key(_content(solution))
     for name, path in names.tables.items():
         table = _TABLES[name](solution)
-        write = partial(tools.write_table, table, record=tools.record_of(
-            options, notes=list(solution.notes)))
+        write = partial(tools.write_table, table, record=record)
         results.obtain(path, f'{key}_{name}', partial(_made, table, write))
     for epoch, own in zip(solution.epochs, exposures, strict=True):
         for k, wcs in zip(own, _all_wcs(epoch), strict=True):
             if wcs is not None:
-                suffix, write = wcs_writer(wcs, epoch.mean_year,
-                                           tools.record_of(options))
+                suffix, write = wcs_writer(wcs, epoch.mean_year, record)
                 results.obtain(names.wcs[k].with_suffix(suffix),
                                f'{key}_wcs{k}', partial(_made, wcs, write))
 

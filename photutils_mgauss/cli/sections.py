@@ -304,7 +304,8 @@ def alignment_section(path, table, record):
 
 def _names_of_epochs(record):
     """Return the names of the files that epochs were made of, by number."""
-    inputs = record.get('options', {}).get('inputs', [])
+    inputs = record.get('exposures',
+                        record.get('options', {}).get('inputs', []))
     return {i: Path(name).name for i, name in enumerate(inputs)}
 
 
@@ -313,7 +314,8 @@ def _alignment_verdict(table, names):
     if not {'n_references', 'n_rejected'} <= set(table.colnames):
         return None
     used = column_values(table, 'n_references')
-    share = column_values(table, 'n_rejected') / np.maximum(used, 1)
+    rejected = column_values(table, 'n_rejected')
+    share = rejected / np.maximum(used + rejected, 1)
     worst = int(np.argmax(share))
     name = names.get(worst, f'epoch {worst}')
     return Verdict(bool(used.min() >= 5 and share[worst] < 0.25),

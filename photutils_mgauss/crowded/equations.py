@@ -82,8 +82,9 @@ class Equations:
         n = len(self.stars.matrix)
         covariance, correlation = np.empty((n, 3, 3)), np.empty(n)
         kernels.joint_covariances(self.stars, self.neighbours.pairs,
-                                  self.neighbours.nearest, covariance,
-                                  correlation)
+                                  self.neighbours.nearest,
+                                  kernels.CovarianceScratch.empty(n),
+                                  covariance, correlation)
         return covariance, correlation
 
 

@@ -77,7 +77,7 @@ def _ask_beside(tile, k, light, wanted, out):
     kernels.evidence_beside(
         tile.stars.x, tile.stars.y, fit, tile.points[k], tile.phases[k],
         model.planes(light), kernels.Limits(REACH, LEAST, 0.0), side, wanted,
-        out)
+        kernels.BesideScratch.empty(), out)
 
 
 def leave_out(tile, threshold):

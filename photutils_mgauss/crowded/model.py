@@ -181,12 +181,14 @@ class Model:
         self._weigh()
 
     def _draw_stamps(self, chosen):
+        widest = self.stamps.width[chosen].max(initial=1)
         kernels.star_stamps(chosen, self.stars.sources, self.stamps,
-                            self.gaussians)
+                            self.gaussians, kernels.Tiling.empty(widest))
 
     def _add_stars(self, chosen, sign):
         kernels.add_stars(chosen, sign, self.stars.sources, self.stamps,
                           self.wing, self.gaussians, _FAINTEST * self.noise,
+                          kernels.WingScratch.empty(self.residual.shape[1]),
                           self.residual)
 
     def background(self):

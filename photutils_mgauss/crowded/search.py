@@ -55,7 +55,7 @@ def _scores(tile, threshold):
                       model.neighbours.pairs, tile.equations.stars)
     kernels.score_beside(fit, templates, model.planes(light),
                          kernels.Limits(REACH, LEAST, float(threshold)),
-                         significance, flux)
+                         kernels.BesideScratch.empty(), significance, flux)
     return significance, flux
 
 

@@ -224,7 +224,7 @@ def model_stamps(problem, coefficients):
     rows = kernel_rows_of_logs(*problem.form.shapes(
         coefficients, problem.basis, problem.local))
     kernels.field_model(problem.stamps.corners, rows,
-                        problem.pixel_integrated, problem.sources,
+                        problem.pixel_integrated or None, problem.sources,
                         problem.n_sources, problem.sky, out)
     return out
 

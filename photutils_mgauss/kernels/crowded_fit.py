@@ -64,6 +64,24 @@ class MeshEquations(NamedTuple):
     share: np.ndarray
 
 
+class CovarianceScratch(NamedTuple):
+    """A star's neighbours, their places and matrix, and its inverse."""
+
+    members: np.ndarray
+    where: np.ndarray
+    matrix: np.ndarray
+    scale: np.ndarray
+    columns: np.ndarray
+
+    @classmethod
+    def empty(cls, n):
+        """Return the memory for n stars."""
+        size = 3 * _MOST_FREE
+        return cls(np.empty(_MOST_FREE, np.int64), np.full(n, -1),
+                   np.empty((size, size)), np.empty(size),
+                   np.empty((4, size)))
+
+
 @kernel
 def mesh_sums(weight, residual, background, rows, columns, n_columns, clip,
               out):
@@ -385,25 +403,22 @@ def scale_matrix(a, size, scale):
             a[r, r] = 1.0
 
 
-@kernel(allocates=True)
-def joint_covariances(stars, pairs, partner, covariance, correlation):
+@kernel
+def joint_covariances(stars, pairs, partner, scratch, covariance,
+                      correlation):
     """
     Put the covariance of each star, neighbours free, into covariance.
 
     covariance is (n, 3, 3); correlation (n,) takes the correlation of the
     flux with that of the star partner[i], 0 where it is none of the
     neighbours. A star's normal matrix is that of itself and up to 12 of its
-    neighbours, those that come first. NaN where it is singular.
+    neighbours, those that come first. NaN where it is singular. scratch is a
+    CovarianceScratch.
     """
     matrix, _, _, blocks = stars
     indptr, neighbour, _ = pairs
-    n = matrix.shape[0]
-    members, where = np.empty(_MOST_FREE, np.int64), np.empty(n, np.int64)
-    for i in range(n):
-        where[i] = -1
-    a = np.empty((3 * _MOST_FREE, 3 * _MOST_FREE))
-    scale, columns = np.empty(3 * _MOST_FREE), np.empty((4, 3 * _MOST_FREE))
-    for i in range(n):
+    members, where, a, scale, columns = scratch
+    for i in range(matrix.shape[0]):
         count = members_of(i, indptr, neighbour, members)
         size = 3 * count
         joint_matrix(members, count, matrix, blocks, indptr, neighbour, where,

@@ -11,8 +11,6 @@ from photutils_mgauss.kernels.crowded_fit import (
     scale_matrix,
 )
 from photutils_mgauss.kernels.crowded_search import (
-    MOST_BESIDE,
-    Scratch,
     score_pixel,
     stars_around,
     template_products,
@@ -115,9 +113,9 @@ def evidence(points, phases, weight, residual, out):
             out.bare[row, column] = bare
 
 
-@kernel(allocates=True)
+@kernel
 def evidence_beside(column, row, fit, points, phases, planes, limits, side,
-                    wanted, out):
+                    wanted, scratch, out):
     r"""
     Ask again at points close to stars, with these free to readjust.
 
@@ -133,16 +131,13 @@ def evidence_beside(column, row, fit, points, phases, planes, limits, side,
     left. No point within limits.reach of a star is more than side points of
     the grid off.
     """
+    members, _, _, sums = scratch
     stamps, cell = phases
     px, py, _ = fit.sources
     weight, residual, light = planes
     ny, nx = residual.shape
     n_rows, n_columns = wanted.shape
     n = stamps.shape[2]
-    size = 3 * MOST_BESIDE
-    members, sums = np.empty(MOST_BESIDE, np.int64), np.empty(3)
-    scratch = Scratch(members, np.empty((size, size)), np.empty((size, 2)),
-                      sums)
     reach = limits.reach
     for i in range(px.size):
         middle, centre = int(np.rint(row[i])), int(np.rint(column[i]))

@@ -55,13 +55,20 @@ class Limits(NamedTuple):
     threshold: float
 
 
-class Scratch(NamedTuple):
+class BesideScratch(NamedTuple):
     """Stars around a pixel, their factors, two right sides, and sums."""
 
     members: np.ndarray
     matrix: np.ndarray
     right: np.ndarray
     sums: np.ndarray
+
+    @classmethod
+    def empty(cls):
+        """Return the memory for the most stars that are free."""
+        size = 3 * MOST_BESIDE
+        return cls(np.empty(MOST_BESIDE, np.int64), np.empty((size, size)),
+                   np.empty((size, 2)), np.empty(3))
 
 
 @kernel
@@ -261,8 +268,8 @@ def score_pixel(x, y, count, fit, template, weight, least, scratch):
     return g / sqrt(info + sums[2]), g / info
 
 
-@kernel(allocates=True)
-def score_beside(fit, templates, planes, limits, significance, flux):
+@kernel
+def score_beside(fit, templates, planes, limits, scratch, significance, flux):
     r"""
     Ask how significant a further star would be on pixels close to stars.
 
@@ -279,15 +286,12 @@ def score_beside(fit, templates, planes, limits, significance, flux):
     and flux are (ny, nx).
     """
     ny, nx = significance.shape
+    members, _, _, sums = scratch
     px, py, _ = fit.sources
     indptr, neighbour, _ = fit.pairs
     weight, residual, light = planes
     stamps, cell = templates
     reach, least, threshold = limits
-    size = 3 * MOST_BESIDE
-    members, sums = np.empty(MOST_BESIDE, np.int64), np.empty(3)
-    scratch = Scratch(members, np.empty((size, size)), np.empty((size, 2)),
-                       sums)
     side = int(ceil(reach))
     for i in range(px.size):
         row, column = int(np.rint(py[i])), int(np.rint(px[i]))

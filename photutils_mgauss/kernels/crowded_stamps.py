@@ -10,7 +10,6 @@ from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import clear
 from photutils_mgauss.kernels.tile import (
     LANES,
-    SCRATCH,
     add_gaussian,
     faintest,
 )
@@ -35,7 +34,7 @@ class Gaussians(NamedTuple):
     rows: np.ndarray
     strides: np.ndarray
     count: np.ndarray
-    integrated: bool
+    integrated: bool | None
 
 
 class Stamps(NamedTuple):
@@ -55,20 +54,32 @@ class Stamps(NamedTuple):
     derivatives: np.ndarray
 
 
-@kernel(allocates=True)
-def star_stamps(chosen, sources, stamps, gaussians):
-    """Fill the stamps of the chosen stars."""
+class WingScratch(NamedTuple):
+    """Columns of a Gaussian that is sampled, points of one integrated."""
+
+    lanes: np.ndarray
+    points: np.ndarray
+
+    @classmethod
+    def empty(cls, nx):
+        """Return the memory for an image of rows of nx pixels."""
+        return cls(np.empty((4, nx)), np.empty((3, ERRORS.size)))
+
+
+@kernel
+def star_stamps(chosen, sources, stamps, gaussians, tiling):
+    """
+    Fill the stamps of the chosen stars.
+
+    tiling is the Tiling for the widest stamp.
+    """
     x, y, _ = sources
     left, bottom, width, offset, derivatives = stamps
     rows, strides, count, integrated = gaussians
-    widest = 0
-    for i in chosen:
-        widest = max(widest, width[i])
-    walk = np.zeros(SCRATCH)
-    tile = np.empty(3 * LANES * widest)
+    walk, tile, _, _ = tiling
     for i in chosen:
         w = width[i]
-        faint = faintest(rows[i, :count[i]]) if integrated else 0.0
+        faint = faintest(rows[i, :count[i]], integrated)
         for first in range(0, w, LANES):
             height = min(LANES, w - first)
             clear(walk, 4 * LANES)
@@ -160,19 +171,18 @@ def _add_lanes(peak, cx, cy, p, s, q, reach, lanes, image):
 
 
 @inner
-def add_wings(rows, flux, cx, cy, integrated, faintest, lanes, scratch,
-              image):
+def add_wings(rows, flux, cx, cy, integrated, faintest, scratch, image):
     """Add a star, each Gaussian out to where it falls below faintest."""
-    if integrated:
-        add_star(rows, flux, cx, cy, True, faintest, scratch, image)
+    if integrated is not None and integrated:
+        add_star(rows, flux, cx, cy, True, faintest, scratch.points, image)
         return
     for k in range(rows.shape[0]):
         a, mx, my, p, s, q = rows[k]
         peak = flux * a
         ratio = abs(peak) / faintest
         if ratio > 1:
-            _add_lanes(peak, cx + mx, cy + my, p, s, q, 2 * log(ratio), lanes,
-                       image)
+            _add_lanes(peak, cx + mx, cy + my, p, s, q, 2 * log(ratio),
+                       scratch.lanes, image)
 
 
 @inner
@@ -185,22 +195,20 @@ def _add_stamp(left, bottom, w, flux, profile, image):
             image[bottom + j, k] += flux * profile[first + k]
 
 
-@kernel(allocates=True)
+@kernel
 def add_stars(chosen, sign, sources, stamps, wing, gaussians, faintest,
-              image):
+              scratch, image):
     """
     Add sign times the chosen stars to the image.
 
     A star whose wing (half a width, integer) reaches over its stamp is drawn
     afresh, each Gaussian out to where it falls below faintest; others are
-    copied from it.
+    copied from it. scratch is a WingScratch.
     """
     ny, nx = image.shape
     x, y, fluxes = sources
     lefts, bottoms, widths, offset, derivatives = stamps
     rows, _, count, integrated = gaussians
-    scratch = np.empty((3, ERRORS.size))
-    lanes = np.empty((4, nx))
     for i in chosen:
         left, bottom, w = lefts[i], bottoms[i], widths[i]
         flux = sign * fluxes[i]
@@ -214,5 +222,5 @@ def add_stars(chosen, sign, sources, stamps, wing, gaussians, faintest,
         if x_low < x_high and y_low < y_high:
             add_wings(rows[i, :count[i]], flux,
                       x[i] - x_low, y[i] - y_low,
-                      integrated, faintest, lanes, scratch,
+                      integrated, faintest, scratch,
                       image[y_low:y_high, x_low:x_high])

@@ -140,7 +140,7 @@ def _pixel_integral(dx, dy, p, s, q):
 @inner
 def point_value(dx, dy, p, s, q, integrated):
     """Return a Gaussian of unit peak, or its integral over a pixel."""
-    if integrated:
+    if integrated is not None and integrated:
         return _pixel_integral(dx, dy, p, s, q)
     return _gaussian(dx, dy, p, s, q)
 
@@ -168,7 +168,7 @@ def _edge(dx, dy, p, s, q):
 @inner
 def point_gradient(dx, dy, p, s, q, integrated):
     """Return dg/dx and dg/dy, of the value or of the pixel integral."""
-    if not integrated:
+    if integrated is None or not integrated:
         g = _gaussian(dx, dy, p, s, q)
         a = p * (dx - s * dy)
         return -a * g, -(q * dy - s * a) * g

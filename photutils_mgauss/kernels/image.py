@@ -171,7 +171,7 @@ def add_star(rows, flux, cx, cy, integrated, faintest, scratch, out):
         if peak == 0:
             continue
         reach = 2 * log(max(abs(peak) / faintest, 1 / DEPTH))
-        if integrated:
+        if integrated is not None and integrated:
             _add_integrated(peak, cx + mx, cy + my, p, s, q, reach,
                             _QUADRATURE_ERROR * highest / abs(a), scratch,
                             out)

@@ -230,12 +230,13 @@ def _say():
 
 # What numba's own pipeline does besides, for objects that kernels do without:
 # closures, contexts, literal unrolling, parallel loops, and expressions of
-# whole arrays.
+# whole arrays. What follows only where an argument is not None stays out of
+# code for None: what integrates over pixels where none is integrated.
 _NOT_NEEDED = frozenset({
     'WithLifting', 'InlineClosureLikes', 'RewriteDynamicRaises',
     'MakeFunctionToJitFunction', 'InlineInlinables', 'FindLiterallyCalls',
     'LiteralUnroll', 'LiteralPropagationSubPipelinePass', 'InlineOverloads',
-    'NopythonRewrites', 'RewriteSemanticConstants', 'DeadBranchPrune',
+    'NopythonRewrites', 'RewriteSemanticConstants',
     'AnnotateTypes', 'DumpParforDiagnostics'})
 
 

@@ -78,7 +78,7 @@ def render(rows, x_0, y_0, flux, integrated, out):
         dx = -x_0 - mx
         for j in range(out.shape[0]):
             dy = j - y_0 - my
-            if integrated:
+            if integrated is not None and integrated:
                 add_integrated_row(flux * a, dx, dy, p, s, q, out[j])
             elif q * dy * dy < LOG_NOTHING:
                 ridge = flux * a * exp(-0.5 * q * dy * dy)

@@ -289,6 +289,11 @@ def _gaussian_reach(row):
 def find_reach(psf, sight):
     """Put how far stars are seen [pix] and what is too faint to join."""
     nodes, _, _, _, integrated = psf
+    _find_reach(nodes, integrated, sight)
+
+
+@inner
+def _find_reach(nodes, integrated, sight):
     reach = 0.0
     peak = 0.0
     for m in range(nodes.shape[0]):
@@ -297,8 +302,11 @@ def find_reach(psf, sight):
             reach = max(reach, _gaussian_reach(nodes[m, k]))
             total += abs(nodes[m, k, 0])
         peak = max(peak, total)
-    sight[0] = reach + _PIXEL if integrated else reach
-    sight[1] = _FAINT * (min(peak, 1.0) if integrated else peak)
+    if integrated is not None and integrated:
+        reach += _PIXEL
+        peak = min(peak, 1.0)
+    sight[0] = reach
+    sight[1] = _FAINT * peak
 
 
 @inner

@@ -113,14 +113,33 @@ def _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height, width,
 
 
 @inner
-def faintest(rows):
+def faintest(rows, integrated):
     """Return what may be left out of each Gaussian of rows (K, 6)."""
+    if integrated is None or not integrated:
+        return 0.0
     peak = 0.0
     for k in range(rows.shape[0]):
         a, _, _, p, _, q = rows[k]
         if a != 0:
             peak += pixel_peak(a, p, q)
     return LEFT_OUT * peak
+
+
+@inner
+def _add_over_pixels(a, dx, dy, p, s, q, by_x, by_y, faint, height, width,
+                     work, tile):
+    """Add a Gaussian, integrated over each pixel, to a tile."""
+    # Next to a node the share of another is nothing, its slope is not.
+    most = pixel_peak(a, p, q) * max(1.0, abs(by_x), abs(by_y))
+    left_out = log(faint / most)
+    if not left_out < 0:
+        return
+    ratio, terms = series_length(p, s, q, left_out)
+    if terms:
+        add_series(a, dx, dy, p, s, q, ratio, terms, sqrt(-2 * left_out),
+                   by_x, by_y, height, width, work, tile)
+    else:
+        _add_points(a, dx, dy, p, s, q, by_x, by_y, True, height, width, tile)
 
 
 @inner
@@ -133,24 +152,16 @@ def add_gaussian(a, dx, dy, p, s, q, stride, by_x, by_y, integrated, faint,
     by_y. What is less than faint may be left out of an integrated Gaussian.
     walk (SCRATCH,) begins with zeros.
     """
-    if integrated:
-        # Next to a node the share of another is nothing, its slope is not.
-        most = pixel_peak(a, p, q) * max(1.0, abs(by_x), abs(by_y))
-        left_out = log(faint / most)
-        if not left_out < 0:
-            return
-        ratio, terms = series_length(p, s, q, left_out)
-        if terms:
-            add_series(a, dx, dy, p, s, q, ratio, terms, sqrt(-2 * left_out),
-                       by_x, by_y, height, width, walk[_WALK:], tile)
-            return
+    if integrated is not None and integrated:
+        _add_over_pixels(a, dx, dy, p, s, q, by_x, by_y, faint, height, width,
+                         walk[_WALK:], tile)
+        return
     left = min(dx - s * dy, dx - s * (dy + height - 1))
     # A walk that begins too far out begins at zero.
-    steep = (integrated or p > 50 or q > 50 or p * abs(s) * height > 200
+    steep = (p > 50 or q > 50 or p * abs(s) * height > 200
              or (left < 0 and p * left * left > 600))
     if steep:
-        _add_points(a, dx, dy, p, s, q, by_x, by_y, integrated, height, width,
-                    tile)
+        _add_points(a, dx, dy, p, s, q, by_x, by_y, None, height, width, tile)
     elif _walk_starts(a, dx - s * dy, dy, p, s, q, stride, by_x, by_y, height,
                       walk):
         _add_walk(p, s, stride[3], width, walk, tile)
@@ -164,9 +175,9 @@ def _fill_tile(x_0, y_0, row, column, height, width, psf, tiling):
     clear(walk, _WALK)
     clear(tile, 3 * LANES * width)
     faint = 0.0
-    if integrated:
-        for corner in range(4):
-            faint += weights[0, corner] * faintest(nodes[index[corner]])
+    for corner in range(4):
+        faint += weights[0, corner] * faintest(nodes[index[corner]],
+                                               integrated)
     for corner in range(4):
         w, wx, wy = weights[0, corner], weights[1, corner], weights[2, corner]
         if w == 0 and wx == 0 and wy == 0:

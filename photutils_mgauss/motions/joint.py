@@ -364,16 +364,23 @@ def solve_all(problem, correction, factor, executor=None, **wanted):
     """
     solve = partial(solve_stars, correction=correction, factor=factor,
                     **wanted)
-    results = list(each_part(solve, problem, executor))
-    return Estimates(*(_join(results, field.name)
-                       for field in fields(Estimates)))
+    whole, start = None, 0
+    # Parts go as they come, or all arrays would be there twice.
+    for part in each_part(solve, problem, executor):
+        if whole is None:
+            whole = _for_all(part, problem.n_stars)
+        stop = start + part.values.shape[1]
+        for name, array in whole.items():
+            array[..., start:stop] = getattr(part, name)
+        start = stop
+    return Estimates(**whole)
 
 
-def _join(results, name):
-    arrays = [getattr(result, name) for result in results]
-    if arrays[0] is None:
-        return None
-    return np.concatenate(arrays, axis=-1)
+def _for_all(part, n):
+    """Return arrays for n stars, of the kinds that a part has."""
+    arrays = {field.name: getattr(part, field.name) for field in fields(part)}
+    return {name: np.empty((*array.shape[:-1], n), array.dtype)
+            for name, array in arrays.items() if array is not None}
 
 
 def total_chi2(problem, estimates):

@@ -172,6 +172,7 @@ def _align(setup, state):
     """Iterate until the maps stand still."""
     before, typical = np.inf, np.sqrt(setup.typical_variance)
     for i in range(MAX_ITERATIONS):
+        problem = frames = None  # as large as all that was measured
         problem, frames, after = _step(setup, state)
         # In units of a typical error.
         size = np.abs(frames.correction).sum(axis=2).max(initial=0) / typical
@@ -197,6 +198,7 @@ def fit(setup, state):
     for i in range(rounds * setup.options.fits_floor):
         after = _systematics(setup, state, problem, frames, anew=i == 0)
         still = not _moved(setup, state, after, 0.02)
+        problem = frames = None
         problem, frames, state = _align(setup, after)
         if still:
             break
@@ -222,6 +224,7 @@ def _with_terms(setup, state):
 def _cleaned(setup, state):
     """Return problem, frames and state with all outliers rejected."""
     for _ in range(MAX_ITERATIONS):
+        problem = frames = None
         problem, frames, state = _align(setup, state)
         if setup.options.clip is None:
             break

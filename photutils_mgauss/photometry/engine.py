@@ -78,7 +78,7 @@ def psf_arrays(model):
     nodes, strides, x_grid, y_grid, integrated : tuple
         The mixtures at the nodes (M, K, 6), what the kernels precompute of
         them (M, K, 4), the axes of the grid, and whether they are integrated
-        over pixels.
+        over pixels (None if not: see `kernels.jit`).
     """
     if not isinstance(model, PSFModel):
         msg = ('psf must be a MultiGaussianPSFModel, GriddedMixturePSF or '
@@ -87,7 +87,8 @@ def psf_arrays(model):
     grid = model.grid
     rows, x_grid, y_grid = (_as_kernels_take(a, np.float64)
                             for a in (grid.rows, grid.x_grid, grid.y_grid))
-    return rows, strides(rows), x_grid, y_grid, model.pixel_integrated
+    return (rows, strides(rows), x_grid, y_grid,
+            model.pixel_integrated or None)
 
 
 def is_fixed_shape(model):

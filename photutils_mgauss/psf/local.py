@@ -38,7 +38,7 @@ class LocalPSF:
     weights: np.ndarray
     means: np.ndarray
     covariances: np.ndarray
-    integrated: bool
+    integrated: bool | None
     order: np.ndarray
     merged: np.ndarray
     profile: np.ndarray | None = None
@@ -69,7 +69,7 @@ class LocalPSF:
         grid = model.grid
         return cls.from_nodes(
             grid.x_grid, grid.y_grid, grid.weights * grid.scales[:, None],
-            grid.means, grid.covariances, bool(model.pixel_integrated))
+            grid.means, grid.covariances, model.pixel_integrated or None)
 
     @property
     def n_rows(self):

@@ -317,7 +317,8 @@ class GaussianMixture(ComparedByValue):
         """
         out = np.zeros(as_shape(shape, 'shape'))
         kernels.render(self.rows, as_real(x_0, 'x_0'), as_real(y_0, 'y_0'),
-                       as_real(flux, 'flux'), bool(pixel_integrated), out)
+                       as_real(flux, 'flux'), bool(pixel_integrated) or None,
+                       out)
         return out
 
     def moments(self):

@@ -12,8 +12,20 @@ from photutils.psf import GriddedPSFModel
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.utils.validation import as_real
 
-# Half the side of the stamp that a star's photons fall on [pix].
-_HALF = 24
+# Half the side of the stamp that a star's photons fall on, and of its middle
+# where charge moves [pix]. The time goes with the area of the middle.
+_HALF, _CORE = 24, 8
+
+# Of fainter stars [electron] the effect moves less than 1e-4 of the charge;
+# they are drawn as if there were none.
+FAINT = 2000.0
+
+
+def repelled(x, y, flux, shape):
+    """Return which stars (n,) are drawn photon by photon."""
+    ny, nx = shape
+    return ((flux >= FAINT) & (np.rint(x) >= 0) & (np.rint(x) < nx)
+            & (np.rint(y) >= 0) & (np.rint(y) < ny))
 
 
 def shoot_stars(psf, x, y, flux, response, strength, rng):
@@ -28,14 +40,11 @@ def shoot_stars(psf, x, y, flux, response, strength, rng):
     sensor = _sensor(strength, rng)
     response = np.pad(response, _HALF, constant_values=1.0)
     wide = np.zeros(response.shape, np.float32)
-    stamps = [_stamp(a, b, wide.shape) for a, b in zip(x, y, strict=True)]
+    stamps = [_stamp(a, b) for a, b in zip(x, y, strict=True)]
     # So many photons that a pixel of the best response loses none of them.
-    best = np.array([1.0 if stamp is None else response[stamp].max()
-                     for stamp in stamps])
-    numbers = rng.poisson(np.maximum(flux, 0) * best)
+    best = np.array([response[stamp].max() for stamp in stamps])
+    numbers = rng.poisson(flux * best)
     for a, b, stamp, number in zip(x, y, stamps, numbers, strict=True):
-        if stamp is None:
-            continue
         middle = np.array([[a - round(a)], [b - round(b)]])
         places = middle + source(a, b, number, rng)
         places = _converted(places, response[stamp], rng)
@@ -43,11 +52,9 @@ def shoot_stars(psf, x, y, flux, response, strength, rng):
     return wide[_HALF:-_HALF, _HALF:-_HALF]
 
 
-def _stamp(x, y, shape):
-    """Return the pixels of a star on the wide image; None if it is off it."""
+def _stamp(x, y):
+    """Return the pixels of a star on the wide image."""
     i, j = round(x), round(y)
-    if not (0 <= i < shape[1] - 2 * _HALF and 0 <= j < shape[0] - 2 * _HALF):
-        return None
     return np.s_[j:j + 2 * _HALF + 1, i:i + 2 * _HALF + 1]
 
 
@@ -148,8 +155,17 @@ def _sensor(strength, rng):
 def _accumulate(sensor, places, stamp):
     """Return the stamp with photons, relative to its middle, added."""
     import galsim
-    image = galsim.ImageF(stamp.copy(), xmin=-_HALF, ymin=-_HALF)
-    x, y = (np.ascontiguousarray(axis) for axis in places)
-    array = galsim.PhotonArray(x.size, x=x, y=y, flux=np.ones(x.size))
-    sensor.accumulate(array, image)
-    return image.array
+    stamp = stamp.copy()
+    inner = (np.abs(places) < _CORE + 0.5).all(axis=0)
+    column, row = np.rint(places[:, ~inner]).astype(int) + _HALF
+    on = (np.minimum(row, column) >= 0) & (np.maximum(row, column)
+                                           <= 2 * _HALF)
+    np.add.at(stamp, (row[on], column[on]), 1)
+    middle = slice(_HALF - _CORE, _HALF + _CORE + 1)
+    image = galsim.ImageF(stamp[middle, middle].copy(), xmin=-_CORE,
+                          ymin=-_CORE)
+    x, y = (np.ascontiguousarray(axis) for axis in places[:, inner])
+    sensor.accumulate(galsim.PhotonArray(x.size, x=x, y=y,
+                                         flux=np.ones(x.size)), image)
+    stamp[middle, middle] = image.array
+    return stamp

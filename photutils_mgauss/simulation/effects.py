@@ -64,8 +64,9 @@ class DetectorEffects:
     brighter_fatter : float, optional
         The strength of the repulsion of charge, 1 for a common CCD. It needs
         galsim and a PSF of mixtures that are integrated over pixels or one
-        that ``Optics.to_gridded_psf`` made, and draws every photon; only
-        stars with their centre on the image are drawn.
+        that ``Optics.to_gridded_psf`` made, and draws every photon of the
+        stars on the image that have 2000 electrons or more. Of fainter
+        ones it would move less than 1e-4 of the charge.
     large_scale_flat : float, optional
         Standard deviation over the detector of the smooth part of the
         response, a polynomial of the fourth degree in x and y: vignetting,

@@ -9,7 +9,10 @@ from functools import partial
 
 import numpy as np
 
-from photutils_mgauss.simulation.brighter_fatter import shoot_stars
+from photutils_mgauss.simulation.brighter_fatter import (
+    repelled,
+    shoot_stars,
+)
 from photutils_mgauss.simulation.effects import (
     SATURATED,
     DetectorEffects,
@@ -115,15 +118,18 @@ def expose(chip, truth, psf, rng, executor):
     renderer = renderer_of(psf)
     electrons = np.empty(chip.instrument.shape, np.float32)
     flags = np.empty(chip.instrument.shape, np.uint8)
-    repel = chip.effects.brighter_fatter
-    stars = _split(renderer, x, y, 0 * flux if repel else flux, chip.bands,
+    strength = chip.effects.brighter_fatter
+    shot = repelled(x, y, flux, electrons.shape) if strength else (
+        np.zeros(len(x), bool))
+    stars = _split(renderer, x[~shot], y[~shot], flux[~shot], chip.bands,
                    FAINTEST)
     parts = map_parallel(partial(_expose_band, chip, renderer), chip.bands,
                          stars, rng.spawn(len(chip.bands)), executor=executor)
     for band, part in zip(chip.bands, parts, strict=True):
         electrons[band], flags[band] = part
-    if repel:
-        electrons += shoot_stars(psf, x, y, flux, chip.response, repel, rng)
+    if strength:
+        electrons += shoot_stars(psf, x[shot], y[shot], flux[shot],
+                                 chip.response, strength, rng)
     add_cosmic_rays(electrons, flags, chip.effects,
                     chip.instrument.exposure_time, rng)
     full_well = chip.instrument.full_well

@@ -11,7 +11,9 @@ from contextvars import ContextVar, copy_context
 from functools import partial
 from itertools import chain
 from queue import Empty, SimpleQueue
-from threading import Thread, current_thread, main_thread
+from threading import Lock, Thread, current_thread, main_thread
+
+from threadpoolctl import threadpool_limits
 
 # Who wants to know how many pieces are done; see `watched`.
 _WATCHER = ContextVar('watcher', default=None)
@@ -95,6 +97,36 @@ class Threads(Executor):
         self.shutdown(wait=kind is None, cancel_futures=kind is not None)
 
 
+class _SingleBlas:
+    """
+    While somebody is inside, linear algebra starts no threads of its own.
+
+    They would wait for each other in loops, on cores that our threads need.
+    The limit is one of the whole process: who comes first sets it, who leaves
+    last lifts it.
+    """
+
+    def __init__(self):
+        self._lock = Lock()
+        self._inside = 0
+        self._limits = None
+
+    def __enter__(self):
+        with self._lock:
+            if self._inside == 0:
+                self._limits = threadpool_limits(1, user_api='blas')
+            self._inside += 1
+
+    def __exit__(self, kind, error, trace):
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._limits.restore_original_limits()
+
+
+_SINGLE_BLAS = _SingleBlas()
+
+
 def _fulfil(future, call):
     """Make a future come true, unless it has been cancelled."""
     if not future.set_running_or_notify_cancel():
@@ -168,7 +200,7 @@ def map_parallel(function, *columns, executor=None, long=False):
     if n_threads < 2 and not waits:
         yield from _told(map(function, *columns), n)
         return
-    with Threads(n_threads) as pool:
+    with _SINGLE_BLAS, Threads(n_threads) as pool:
         yield from _told(pool.map(function, *columns), n)
 
 

@@ -103,7 +103,8 @@ def bounds(psf, truth, variance):
         np.full(n, width), np.arange(n) * width**2,
         np.empty((3, n * width**2)))
     kernels.star_stamps(np.arange(n), kernels.Sources(x, y, flux), stamps,
-                        LocalPSF.of(psf).gaussians_at(x, y))
+                        LocalPSF.of(psf).gaussians_at(x, y),
+                        kernels.Tiling.empty(width))
     equations = kernels.StarEquations(np.empty((n, 3, 3)), np.empty((n, 3)),
                                       np.empty((n, 3)), np.empty((0, 3, 3)))
     kernels.own_equations(flux, stamps, 1 / variance,

@@ -45,7 +45,8 @@ class CallablePSF:
                                 np.arange(n) * width**2,
                                 np.empty((3, n * width**2)))
         kernels.star_stamps(np.arange(n), kernels.Sources(x, y, np.ones(n)),
-                            stamps, self.psf.gaussians_at(x, y))
+                            stamps, self.psf.gaussians_at(x, y),
+                            kernels.Tiling.empty(width))
         return stamps.derivatives.reshape(3, n, width, width)
 
     def render_model(self, x, y, stampsz=None):

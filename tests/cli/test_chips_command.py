@@ -73,9 +73,39 @@ def test_catalogues_of_one_file_are_one_exposure(camera, capsys):
     away = stars['pmra'].value - field.pm[0, numbers]
     pull = (away / stars['pmra_error'].value)[solved]
     assert 0.85 < np.sqrt(np.mean(pull**2)) < 1.15
+    assert stars.meta['mgauss']['exposures'] == [
+        f'night{number}.fits' for number in range(len(YEARS))]
     for path in catalogues:
         name = path.rpartition('/')[2].removesuffix('_cat.ecsv')
         assert (folder / 'out' / f'{name}_wcs.fits').is_file()
+
+
+def test_the_report_shows_each_chip_and_the_references(camera, tmp_path,
+                                                       monkeypatch):
+    pytest.importorskip('matplotlib')
+    folder, catalogues, _, _ = camera
+    monkeypatch.chdir(tmp_path)
+    assert main(['motions', *catalogues, '--chips', '--distortion', 'poly-3',
+                 '--references', str(folder / 'known.ecsv'),
+                 '--output', 'out']) == 0
+    assert main(['report', 'out', '--output', 'page.html']) == 0
+    page = (tmp_path / 'page.html').read_text(encoding='utf-8')
+    for chip in ('SCI,1', 'SCI,2'):
+        assert f'Mean residuals of all exposures over chip {chip}' in page
+    for number in range(len(YEARS)):
+        assert f'Residuals of night{number}.fits' in page
+    assert 'minus those of their catalogue' in page
+    stars = QTable.read('out/motions.ecsv')
+    known = np.isfinite(stars['dpmra'].value)
+    assert 40 < known.sum() <= 60
+    assert (stars['reference'][known] == 'star').all()
+    pull = (stars['dpmra'] / stars['dpmra_error'])[known]
+    assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.3
+    residuals = QTable.read('out/residuals.ecsv')
+    assert set(residuals['chip']) == {'SCI,1', 'SCI,2'}
+    judged = np.isfinite(residuals['dra'].value)
+    assert judged.mean() > 0.9
+    assert np.isfinite(residuals['dx_pix'].value[judged]).all()
 
 
 def _near(stars, field):

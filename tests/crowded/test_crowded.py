@@ -221,8 +221,8 @@ def test_wings_are_those_of_the_exact_gaussian(rng):
                         1 / covariance[1, 1]])
         cx, cy = rng.uniform(-6, 46, 2)
         image = np.zeros((40, 40))
-        ADD_WINGS(row[None], 1.0, cx, cy, False, 1e-6,
-                          np.empty((4, 40)), np.empty((3, 9)), image)
+        ADD_WINGS(row[None], 1.0, cx, cy, None, 1e-6,
+                  kernels.WingScratch.empty(40), image)
         offset = np.stack([x - cx - 0.2, y - cy + 0.1], axis=-1)
         exact = 3 * np.exp(-0.5 * np.einsum(
             '...i,ij,...j', offset, np.linalg.inv(covariance), offset))

@@ -194,6 +194,29 @@ jit.KERNELS.pop('_fill', None)
 fill._cache = jit._NotKept()
 
 
+def _longer(x, by):
+    if by is not None and by > 0:
+        return x + by.no_such_name
+    return x
+
+
+def _stretch(values, by):
+    for i in range(values.size):
+        values[i] = longer(2 * values[i], by)
+
+
+longer = jit.inner(_longer)
+stretch = jit.kernel(_stretch)
+jit.KERNELS.pop('_stretch', None)
+stretch._cache = jit._NotKept()
+
+
+def test_what_needs_an_argument_that_is_none_is_not_compiled():
+    values = np.arange(3.0)
+    stretch(values, None)
+    assert values.tolist() == [0, 2, 4]
+
+
 @pytest.fixture(scope='module')
 def filled():
     values = np.arange(5.0)

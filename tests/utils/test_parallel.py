@@ -7,6 +7,7 @@ from threading import Barrier, Event, Timer
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from photutils_mgauss.utils import parallel
 from photutils_mgauss.utils.parallel import (
@@ -48,6 +49,32 @@ def test_results_come_in_the_order_of_the_work(executor):
 def test_pieces_run_side_by_side(executor):
     together = Barrier(4, timeout=10)
     list(map_parallel(lambda _: together.wait(), range(4), executor=executor))
+
+
+def blas_threads():
+    return {library['num_threads'] for library in threadpool_info()
+            if library['user_api'] == 'blas'}
+
+
+def test_linear_algebra_in_pieces_has_no_threads_of_its_own():
+    def inside(_):
+        together.wait()
+        return blas_threads()
+
+    together = Barrier(4, timeout=10)
+    with threadpool_limits(3, user_api='blas'):
+        assert list(map_parallel(inside, range(4))) == 4 * [{1}]
+        assert blas_threads() == {3}
+
+
+def test_the_last_of_several_users_gives_linear_algebra_its_threads_back():
+    with threadpool_limits(3, user_api='blas'):
+        first, second = (map_parallel(abs, range(4)) for _ in range(2))
+        assert next(first) == next(second) == 0
+        first.close()
+        assert blas_threads() == {1}
+        second.close()
+        assert blas_threads() == {3}
 
 
 def test_nothing_begins_after_an_exception(executor):
