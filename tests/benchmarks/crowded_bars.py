@@ -226,7 +226,9 @@ def run(args):
                              many), strict=True))
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')
-        for name in PARTS:
-            if name in args.bars:
-                parts[name](bars, args, optics)
-    bars.show()
+        try:
+            for name in PARTS:
+                if name in args.bars:
+                    parts[name](bars, args, optics)
+        finally:
+            bars.show()
