@@ -325,7 +325,7 @@ def _bins(run, motions):
     for count in CAMPAIGNS:
         some = part[part['count'] == count]
         for low, here in binned(some['mag'], EDGES):
-            if here.sum() >= 8:
+            if here.sum() >= 5:
                 rows += [_bin(run, some[here], count, low, name)
                          for name in MOTIONS]
     return QTable(rows=rows, names=(
@@ -450,6 +450,8 @@ def draw_medians(tables):
            ylabel='scatter about the truth [mas / yr]',
            title=f'joint solution, {MOTIONS["pmra"]}, by g')
     ax.legend(ncols=2)
+    canvas.legend(*axes[0, 0].get_legend_handles_labels(), ncols=3,
+                  loc='outside lower center')
     return canvas
 
 
@@ -467,8 +469,6 @@ def _draw_recipe(ax, table, recipe):
             label='printed: below 1.0, about 0.8')
     ax.set(xlabel='number of observations', yscale='log',
            ylabel='error of a motion [mas / yr]', title=RECIPES[recipe])
-    if recipe == 'joint':
-        ax.legend()
 
 
 def compare_medians(tables):

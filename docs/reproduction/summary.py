@@ -19,7 +19,8 @@ Made on {date} with ``{command}``, with
 {sizes}
 
 All effects of the detectors that the paper lists are on in all images, and
-are calibrated and masked as :doc:`/simulation` says. {repel}
+are calibrated and masked as :doc:`/simulation` says.
+{repel}
 What a figure shows is stored in the tables below it, with date, versions and
 settings in their headers.
 
