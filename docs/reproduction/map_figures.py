@@ -3,7 +3,7 @@ import numpy as np
 from astropy.table import QTable, vstack
 from peers import AbsentError, absent, psfex
 from scenes import detector, forget
-from settings import TABLE_2_DETECTORS, place_of
+from settings import BANDS, TABLE_2_DETECTORS, place_of
 from store import Comparison, Figure, Group
 from styles import canvas_of
 
@@ -105,6 +105,9 @@ def draw(name, error, tables):
     limit = np.nanpercentile(np.abs(maps[f'{name}_{error}']), 98)
     for ax in axes.flat:
         ax.set_axis_off()
+    for number in set(BANDS) - set(numbers.tolist()):
+        row, column = place_of(number)
+        _absent_panel(axes[row, column - 1], number)
     for number in numbers:
         part = maps[maps['detector'] == number]
         row, column = place_of(int(number))
@@ -113,6 +116,17 @@ def draw(name, error, tables):
                           extend='both')
     bar.ax.tick_params(direction='out')
     return canvas
+
+
+def _absent_panel(ax, number):
+    """Draw the frame of a detector that a small run leaves out."""
+    ax.set_axis_on()
+    ax.set(xticks=[], yticks=[], aspect='equal')
+    ax.text(0.5, 0.5, f'#{number:02d} {BANDS[number]}\nnot measured',
+            ha='center', va='center', fontsize=6, color='0.5',
+            transform=ax.transAxes)
+    for spine in ax.spines.values():
+        spine.set_color('0.7')
 
 
 def _panel(ax, part, name, limit):

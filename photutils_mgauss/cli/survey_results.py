@@ -207,7 +207,7 @@ def write_dataset(folder, tables, name, references=None):
     for field, (path, pixels) in tables.items():
         for pixel in pixels if pixels is not None else _pixels_of_file(path):
             wanted.setdefault(pixel, []).append((field, path))
-    counts = {}
+    counts, written = {}, set()
     for pixel, fields in sorted(wanted.items()):
         parts = _in_pixel(pixel, fields, known)
         path = (folder / 'dataset' / f'Norder={_ORDER}'
@@ -219,6 +219,10 @@ def write_dataset(folder, tables, name, references=None):
         with tools.whole_file(path) as draft:
             parquet.write_table(whole, draft)
         counts[pixel] = whole.num_rows
+        written.add(path)
+    for path in (folder / 'dataset').rglob('Npix=*.parquet'):
+        if path not in written:
+            path.unlink()  # stars of an earlier run
     _describe(folder, counts, name)
     return sum(counts.values())
 
@@ -288,27 +292,35 @@ def _healpix(ra, dec, order):
 
 
 def _arrow(table, field):
-    """Return a table for Parquet, units in the metadata of columns."""
+    """Return a table for Parquet, units and meanings with the columns."""
     import pyarrow as pa
-    columns = {f'_healpix_{_INDEX_ORDER}': (_index(table, _INDEX_ORDER), '')}
+    columns = {f'_healpix_{_INDEX_ORDER}': (_index(table, _INDEX_ORDER), {})}
     for name in table.colnames:
         values = np.ma.filled(np.ma.asarray(getattr(
             table[name], 'value', table[name])), _missing(table[name]))
-        unit = str(getattr(table[name], 'unit', '') or '')
+        facts = _facts(table[name])
         if values.ndim == 1:
-            columns[name] = values, unit
+            columns[name] = values, facts
         elif values.ndim == 2:
-            columns |= {f'{name}_{k}': (values[:, k], unit)
+            columns |= {f'{name}_{k}': (values[:, k], facts)
                         for k in range(values.shape[1])}
-    columns['field'] = np.full(len(table), field), ''
+    columns['field'] = np.full(len(table), field), {}
     fields, arrays = [], []
-    for name, (values, unit) in columns.items():
+    for name, (values, facts) in columns.items():
         array = pa.array(values.astype(str) if values.dtype.kind in 'OU'
                          else values)
         arrays.append(array)
-        fields.append(pa.field(name, array.type,
-                               metadata={'unit': unit} if unit else None))
+        fields.append(pa.field(name, array.type, metadata=facts or None))
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
+
+
+def _facts(column):
+    """Return unit, meaning and description of a column, where known."""
+    facts = {'unit': getattr(column, 'unit', None),
+             'ucd': (column.info.meta or {}).get('ucd'),
+             'description': column.info.description}
+    return {name: str(fact) for name, fact in facts.items()
+            if fact is not None and str(fact)}
 
 
 def _missing(column):

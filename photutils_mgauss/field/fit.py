@@ -20,8 +20,8 @@ from photutils_mgauss.field.base import (
     star_table,
 )
 from photutils_mgauss.field.brighter_fatter import measure_fattening
-from photutils_mgauss.field.choice import by_default, choose
-from photutils_mgauss.field.contexts import context_names, lateral_shifts
+from photutils_mgauss.field.choice import choose
+from photutils_mgauss.field.contexts import lateral_shifts
 from photutils_mgauss.field.covariance import honest_covariance
 from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.growth import (
@@ -40,15 +40,14 @@ from photutils_mgauss.field.input import (
 from photutils_mgauss.field.misfit import misfit
 from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.field.normal import Workers, model_stamps
+from photutils_mgauss.field.options import FieldOptions
 from photutils_mgauss.field.pixel import chosen_pixel, warn_of_phase
+from photutils_mgauss.field.progress import progress
 from photutils_mgauss.field.tuned_field import TunedMixtureField, known_shapes
-from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
 
 __all__ = ['fit_mixture_field']
 
 _LOG = logging.getLogger('photutils_mgauss')
-# The degree of the polynomials with a PSF to start from.
-_TUNED_DEGREE = 1
 # How often the field follows what bright stars are wider by.
 _FATTER_STEPS = 2
 # The weight of the centre in widths of the core, and at most in radii of the
@@ -62,7 +61,8 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
                       effective_gain=None, reject=True, regularization=None,
                       start=None, centre='core', normalise='auto',
                       pixel_integrated='auto', correlated_noise=True,
-                      contexts=(), brighter_fatter=False, executor=None):
+                      contexts=(), brighter_fatter=False, executor=None,
+                      progress_bar=False):
     """
     Fit a PSF field to the pixels of stars.
 
@@ -172,6 +172,9 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         stars, that of others needs their ``flux``. Not with ``start``.
     executor : `~concurrent.futures.Executor`, optional
         Where stars are worked on; by default a pool of threads.
+    progress_bar : bool, optional
+        Whether to show a bar with what is being fitted, and how often the
+        pixels of stars were gone through.
 
     Returns
     -------
@@ -197,82 +200,59 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
     array([[2. , 0.3],
            [0.3, 1.5]])
     """
-    n_components = _number(n_components, 'n_components', 1)
-    degree = _number(degree, 'degree', 0)
-    if radius is not None:
-        radius = as_real(radius, 'radius', minimum=2)
-    if regularization is not None:
-        regularization = as_real(regularization, 'regularization', above=0)
-    contexts = context_names(contexts)
-    _check_words(centre, normalise, brighter_fatter, contexts)
-    if start is not None:
-        _check_known(normalise, contexts, brighter_fatter)
-    pixel_integrated = _pixel_integrated(pixel_integrated, start)
-    sample, radius = _read(data, stars, error, mask, radius, effective_gain,
-                           contexts)
-    if correlated_noise:
-        allow_for_correlation(sample)
-    if start is not None and degree is None:
-        degree = _TUNED_DEGREE
-    n_components, degree = by_default(n_components, degree, len(sample.row))
-    top = possible_degree(degree, len(sample.row))
-    problem = sample.problem(top, local_bkg)
-    with Workers(executor) as workers:
-        if start is not None:
-            problem.pixel_integrated = pixel_integrated
-            fit = stages.tune(
-                _known(problem, sample, start), top, workers, reject=reject,
-                strength=regularization or 1.0)
-            return _tuned(fit, sample, start, radius, centre)
-        problem.pixel_integrated = chosen_pixel(
-            problem, pixel_integrated, regularization or 1.0, workers)
-        fit, choice = _free(problem, n_components, degree, top, workers,
-                            regularization, reject)
-        fit, fatter = _fatter(fit, brighter_fatter, workers, reject)
-    field = _result(fit, sample, radius, choice, centre, fatter)
-    if normalise == 'stamps':
-        return field
-    return _with_wings(field, sample, read_exposures(data, stars, error,
-                                                     mask), normalise)
-
-
-def _check_words(centre, normalise, brighter_fatter, contexts):
-    """Raise unless the options are those that there are."""
-    as_choice(centre, 'centre', ('core', 'flux', 'catalogue'))
-    as_choice(normalise, 'normalise', ('auto', 'stamps', 'curve-of-growth'))
-    if centre == 'catalogue' and not contexts:
-        msg = ("centre must be 'core' or 'flux' without contexts, got "
-               "'catalogue'")
-        raise ValueError(msg)
-    if not isinstance(brighter_fatter, (bool, np.bool_)) and (
-            brighter_fatter != 'auto'):
-        msg = ("brighter_fatter must be 'auto', True or False, got "
-               f'{brighter_fatter!r}')
-        raise ValueError(msg)
-
-
-def _check_known(normalise, contexts, brighter_fatter):
-    """Raise if more is asked of a known PSF than its changes."""
-    if normalise == 'curve-of-growth':
-        msg = ("normalise must be 'stamps' with start, whose wings are known "
-               f'already, got {normalise!r}')
-        raise ValueError(msg)
-    if contexts or brighter_fatter is True:
-        msg = ('contexts and brighter_fatter=True must not be given with '
-               'start, of which only changes with position are fitted')
-        raise ValueError(msg)
-
-
-def _read(data, stars, error, mask, radius, gain, contexts):
-    """Return the sample and the radius of its stamps."""
+    options = FieldOptions(
+        n_components, degree, radius, local_bkg, effective_gain, reject,
+        regularization, start, centre, normalise, pixel_integrated,
+        correlated_noise, contexts, brighter_fatter)
     given = data, stars, error, mask
-    if radius is not None:
-        return read_sample(*given, radius, gain, contexts), radius
-    sample = read_sample(*given, FIRST_RADIUS, gain, contexts)
+    sample, radius = _read(given, options)
+    if options.correlated_noise:
+        allow_for_correlation(sample)
+    n_components, degree = options.size(len(sample.row))
+    top = possible_degree(degree, len(sample.row))
+    problem = sample.problem(top, options.local_bkg)
+    with Workers(executor) as workers, progress(workers, progress_bar):
+        if start is not None:
+            return _tuned_field(problem, sample, radius, top, options,
+                                workers)
+        field = _free_field(problem, sample, radius, n_components, degree,
+                            top, options, workers)
+    if options.normalise == 'stamps':
+        return field
+    return _with_wings(field, sample, read_exposures(*given),
+                       options.normalise)
+
+
+def _read(given, options):
+    """Return the sample and the radius of its stamps."""
+    how = options.effective_gain, options.contexts
+    if options.radius is not None:
+        return read_sample(*given, options.radius, *how), options.radius
+    sample = read_sample(*given, FIRST_RADIUS, *how)
     radius = own_radius(sample.stamps)
     if radius != FIRST_RADIUS:
-        sample = read_sample(*given, radius, gain, contexts)
+        sample = read_sample(*given, radius, *how)
     return sample, radius
+
+
+def _tuned_field(problem, sample, radius, degree, options, workers):
+    """Return a known PSF as the stars change it."""
+    problem.pixel_integrated = options.pixel_integrated
+    fit = stages.tune(_known(problem, sample, options.start), degree, workers,
+                      strength=options.strength, reject=options.reject)
+    return _tuned(fit, sample, options.start, radius, options.centre)
+
+
+def _free_field(problem, sample, radius, n_components, degree, top, options,
+                workers):
+    """Return the field of a PSF of which nothing is known."""
+    problem.pixel_integrated = chosen_pixel(
+        problem, options.pixel_integrated, options.strength, workers)
+    fit, choice = _free(problem, n_components, degree, top, workers,
+                        options.regularization, options.reject)
+    fit, fatter = _fatter(fit, options.brighter_fatter, workers,
+                          options.reject)
+    return _result(fit, sample, radius, choice, options.centre, fatter)
 
 
 def _fatter(fit, wanted, workers, reject):
@@ -350,29 +330,18 @@ def _free(problem, n_components, degree, top, workers, strength, reject):
     fit = stages.run(problem, n_components, degree, workers,
                      strength=strength, reject=reject)
     if problem.pixel_integrated:
-        stages.allow_for_misfit(fit, misfit(fit), workers)
+        _allow_for_misfit(fit, workers)
     return fit, choice
 
 
-def _number(value, name, minimum):
-    if value is None or (isinstance(value, str) and value == 'auto'):
-        return value
-    return as_integer(value, name, minimum=minimum)
-
-
-def _pixel_integrated(value, start):
-    """Return whether to integrate over pixels, or 'auto'."""
-    if not isinstance(value, (bool, np.bool_)) and value != 'auto':
-        msg = f"pixel_integrated must be 'auto', True or False, got {value!r}"
-        raise ValueError(msg)
-    if start is None:
-        return value if isinstance(value, str) else bool(value)
-    known = bool(getattr(start, 'pixel_integrated', False))
-    if value is True and not known:
-        msg = ('pixel_integrated must not be True where start is sampled: its '
-               "mixtures contain the pixel already; leave it at 'auto'")
-        raise ValueError(msg)
-    return known if isinstance(value, str) else bool(value)
+def _allow_for_misfit(fit, workers):
+    """Set what the light in pixels is off by, and stars' numbers to it."""
+    found = misfit(stages.with_errors(fit, 0.0, workers))
+    plain = stages.with_errors(fit, found, workers)
+    fit.accuracy = found
+    fit.problem.sources, fit.problem.sky = (plain.problem.sources,
+                                            plain.problem.sky)
+    fit.equations = replace(fit.equations, chi2=plain.equations.chi2)
 
 
 def _known(problem, sample, start):

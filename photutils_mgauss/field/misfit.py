@@ -6,15 +6,15 @@ shapes make most of what few pixels with light say: what few Gaussians cannot
 be is hidden in positions, differently at each place in a pixel, and what is
 left in the residuals is small. Let the light of pixel i be off by
 :math:`\epsilon L_i`, independently. With J and G the derivatives by a star's
-own numbers and by the shapes, and residuals z in units of the errors that the
-fit has assumed, which contain the share :math:`a` of the light,
+own numbers and by the shapes, and residuals z in units of the errors without
+that,
 
 .. math::
 
     C = P - P G V G^T P , \quad P = 1 - J (J^T J)^{-1} J^T ,
 
-is the covariance of z where a is right, V being that of the shapes there, and
-:math:`C + (\epsilon^2 - a^2)\, C D C` is what it is otherwise, D holding
+is the covariance of z where all light is right, V being that of the shapes
+there, and :math:`C + \epsilon^2\, C D C` is what it is otherwise, D holding
 :math:`L_i^2` over the variance. The sum of :math:`D_i z_i^2` of each star says
 how large :math:`\epsilon` is: the most likely one is taken.
 """
@@ -47,7 +47,8 @@ def misfit(fit):
     Parameters
     ----------
     fit : FieldFit
-        Of optics that are integrated over pixels.
+        Of optics that are integrated over pixels, its weights those of the
+        noise alone.
 
     Returns
     -------
@@ -67,8 +68,7 @@ def misfit(fit):
     sums = np.array([_sums(*_pixels(part, i, residual[i], shapes[i]), each)
                      for i, each in enumerate(covariances)])
     found, expected, response = sums[sums[:, 1] > 0].T
-    return _most_likely(found, expected - fit.accuracy**2 * response,
-                        response)
+    return _most_likely(found, expected, response)
 
 
 def _most_likely(found, noise, response):

@@ -149,6 +149,8 @@ class Workers:
     def __init__(self, executor=None):
         self._own = executor is None
         self.executor = executor
+        # Who is told of the stage that begins, and of each pass, with None.
+        self.told = None
 
     def __enter__(self):
         if self._own:
@@ -158,6 +160,11 @@ class Workers:
     def __exit__(self, *error):
         if self._own:
             self.executor.__exit__(*error)
+
+    def tell(self, stage=None):
+        """Tell who watches that a stage begins, or that a pass is done."""
+        if self.told is not None:
+            self.told(stage)
 
     def map(self, function, n_stars, *args):
         """Call function(*args of a part of the stars) for each part."""
@@ -178,6 +185,7 @@ def equations(problem, coefficients, workers):
         problem.stamps.corners, problem.basis, problem.local,
         problem.sources, problem.anchors, problem.hold, problem.n_sources,
         problem.sky, problem.used)
+    workers.tell()
     matrix = sum(part.matrix for part in parts)
     matrix = np.triu(matrix) + np.triu(matrix, 1).T
     return Equations(matrix, sum(part.right for part in parts),

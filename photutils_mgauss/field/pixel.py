@@ -70,7 +70,7 @@ def warn_of_phase(mixture):
             f'changes by {error:.1%} (rms) with the place of a star in its '
             'pixel, and fluxes with it: the pixels are too coarse for a PSF '
             'that is sampled; use pixel_integrated=True', AstropyUserWarning,
-            stacklevel=4)
+            stacklevel=5)
 
 
 def _integrals(rows, x, y):

@@ -41,6 +41,10 @@ _ADAPTATIONS = 3
 PIXEL_VARIANCE = 1 / 12
 # Relative error of the PSF assumed before anything is known of it.
 _FIRST_ACCURACY = 0.1
+# What few Gaussians may lack of coarse optics in any pixel, as a share of a
+# star's flux. The many faint pixels of rings would otherwise decide what the
+# Gaussians are, at the cost of the core, which has the positions.
+_LACK = 1e-3
 
 
 @dataclass
@@ -64,6 +68,9 @@ class FieldFit:
         Their errors, by number, then exposure, if there are several.
     fattening : (3,) `~numpy.ndarray` or None
         The covariance that each unit of flux adds [pix^2], if that is fitted.
+    lack : float
+        What the Gaussians may lack in any pixel, as a share of the star's
+        flux, which is part of the weights.
     """
 
     problem: FieldProblem
@@ -75,6 +82,7 @@ class FieldFit:
     blurs: np.ndarray = field(default_factory=lambda: np.zeros((1, 3)))
     blur_covariance: np.ndarray = None
     fattening: np.ndarray = None
+    lack: float = 0.0
 
     def added(self):
         """Return what is added to the covariances of each star, (n, 3)."""
@@ -198,6 +206,7 @@ def begin(problem, n_components, strength, workers, ladders=None):
     The mixture starts from the best of ``ladders``; by default these are
     several where pixels are integrated.
     """
+    workers.tell('the mean PSF')
     if ladders is None:
         ladders = _LADDERS if problem.pixel_integrated else (PLAIN,)
     brightest = np.argsort(-problem.sources[:, 0, 2])[:_START_STARS]
@@ -242,7 +251,13 @@ def _new_state(problem, shapes, width, strength):
     coefficients[0] = shapes
     prior = Prior.about(shapes, terms, width, strength, _widest(problem))
     return FieldFit(problem, coefficients, prior, None, _FIRST_ACCURACY,
-                    np.zeros(problem.stamps.good.shape, bool))
+                    np.zeros(problem.stamps.good.shape, bool),
+                    lack=_lack(problem))
+
+
+def _lack(problem):
+    """Return what Gaussians may lack, nothing where they are sampled."""
+    return _LACK if problem.pixel_integrated else 0.0
 
 
 def _widest(problem):
@@ -282,10 +297,21 @@ def weigh(state, *, reject, share=1.0):
     if residual is not None and share is not None:
         state.accuracy = share * _accuracy(residual, light, variance,
                                            problem)
-    variance = variance + (state.accuracy * light) ** 2
+    variance = (variance + (state.accuracy * light) ** 2
+                + _lacking(state, light))
     if reject and residual is not None:
         _reject(state, residual, variance + (_ALLOWANCE * light) ** 2)
     problem.weights = np.where(good & ~state.deviant_pixels, 1 / variance, 0)
+
+
+def _lacking(state, light):
+    """Return the variance (n, 1, 1) of what Gaussians lack in any pixel."""
+    if state.lack == 0:
+        return 0.0
+    # What weights sum to is not known before the first fit.
+    flux = (light.sum(axis=(1, 2)) if state.equations is None
+            else state.fluxes())
+    return (state.lack * flux[:, None, None]) ** 2
 
 
 def _accuracy(residual, light, variance, problem):
@@ -377,7 +403,8 @@ def _first_state(problem, n_components, degree, strength, workers):
                                              *shapes.shape))])
     return FieldFit(problem, start, prior, None, _FIRST_ACCURACY,
                     np.zeros(problem.stamps.good.shape, bool),
-                    np.zeros((problem.exposure.max() + 1, 3)))
+                    np.zeros((problem.exposure.max() + 1, 3)),
+                    lack=_lack(problem))
 
 
 def _stage(state, index, degree, workers, reject, *, adapt=False):
@@ -388,9 +415,11 @@ def _stage(state, index, degree, workers, reject, *, adapt=False):
     """
     terms = n_terms(degree)
     few = state.problem.subset(index).with_terms(terms)
+    workers.tell(f'degree {degree}')
     part = FieldFit(few, _raised(state.coefficients, terms, few.n_extra),
                     state.prior.first(terms), None, state.accuracy,
-                    np.zeros(few.stamps.good.shape, bool), state.blurs)
+                    np.zeros(few.stamps.good.shape, bool), state.blurs,
+                    lack=state.lack)
     few.local = part.added()
     _settle_all(part, workers)
     for _ in range(2):
@@ -470,22 +499,31 @@ def _finish(state, degree, workers, reject):
 
 def polish(state, workers, reject):
     """Fit all at the last degree until nothing changes; return the state."""
+    workers.tell('all stars')
     _settle_all(state, workers)
     for share, tolerance in ((0.3, 0.3), (0.3, 0.1), (1, 0.01)):
         _fit_blurs(state, workers)
         weigh(state, reject=reject, share=share)
         advance(state, workers, tolerance=tolerance, max_steps=8)
+    workers.tell('shrinkage')
     for _ in range(_ADAPTATIONS if len(state.coefficients) > 1 else 0):
         _adapt(state, workers, reject)
     return state
 
 
-def allow_for_misfit(state, misfit, workers):
-    """Take the light in pixels to be off by this share of it, in place."""
-    if misfit != state.accuracy:
-        state.accuracy = misfit
-        weigh(state, reject=False, share=None)
-        advance(state, workers, tolerance=0.01, max_steps=10)
+def with_errors(state, misfit, workers):
+    """
+    Return the fit as it looks under weights of noise and misfit alone.
+
+    The shapes stay, each stamp's own numbers are fitted anew. Nothing of the
+    problem is shared.
+    """
+    every = np.arange(len(state.problem.basis))
+    plain = replace(state, problem=state.problem.subset(every),
+                    accuracy=misfit, lack=0.0)
+    weigh(plain, reject=False, share=None)
+    advance(plain, workers, max_steps=0)
+    return plain
 
 
 def _adapt(state, workers, reject):

@@ -108,7 +108,9 @@ def test_a_survey_ends_in_motions_and_runs_only_what_changed(survey, capsys):
     whole = dataset.dataset(folder / 'motions_hats' / 'dataset',
                             format='parquet').to_table()
     assert whole.num_rows == placed
-    assert whole.schema.field('pmra').metadata[b'unit'] == b'mas / yr'
+    facts = whole.schema.field('pmra').metadata
+    assert facts[b'unit'] == b'mas / yr'
+    assert facts[b'ucd'] == b'pos.pm;pos.eq.ra'
     assert whole['_healpix_29'].to_numpy().dtype == np.int64
     page = (folder / 'index.html').read_text()
     assert page.count('<tr') == 2 + 5 + 2
@@ -117,10 +119,15 @@ def test_a_survey_ends_in_motions_and_runs_only_what_changed(survey, capsys):
     before = stamps(folder)
     assert '1 failed, 6 of an earlier run' in run(survey, capsys)
     assert stamps(folder) == before
+    # Stars of an earlier run that are nowhere now would be found twice.
+    stale = folder / 'motions_hats/dataset/Norder=5/Dir=0/Npix=7.parquet'
+    stale.parent.mkdir(parents=True, exist_ok=True)
+    stale.touch()
     # One image changed: it and its field.
     os.utime(read_survey(survey).exposures[1].path)
     assert '1 failed, 4 of an earlier run' in run(survey, capsys)
     assert json.loads((folder / 'summary.json').read_text())['kept'] == 4
+    assert not stale.exists()
 
 
 def run(survey, capsys):

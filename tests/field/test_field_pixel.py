@@ -142,6 +142,31 @@ def test_wide_stars_are_sampled_and_agree_with_integrated_ones():
         assert_allclose(one - one.mean(), other - other.mean(), atol=5e-4)
 
 
+def test_a_ring_of_light_does_not_decide_the_core():
+    turn = 2 * np.pi * np.arange(12) / 12
+    ring = 2.2 * np.column_stack([np.cos(turn), np.sin(turn)])
+    weights = np.r_[0.5, 0.3, np.full(12, 0.2 / 12)]
+    means = np.vstack([[[0, 0], [0.25, 0.1]], ring])
+    optics = GaussianMixture(weights, means - weights @ means, [
+        [[0.1, 0.02], [0.02, 0.14]], [[0.4, 0], [0, 0.3]],
+        *12 * [0.12 * np.eye(2)]])
+    # Three Gaussians can be the core, or part of it and of the ring.
+    data, error, stars = image(optics, photons=1e5)
+    psf = fit_mixture_field(
+        data, stars, error=error, n_components=3, degree=0, radius=6,
+        normalise='stamps', pixel_integrated=True).to_grid(2)
+    x, y, _ = phases(psf, optics)
+    assert np.hypot(x.std(), y.std()) < 0.02
+
+
+def test_a_bar_shows_what_is_being_fitted(capsys):
+    fitted(progress_bar=True)
+    shown = capsys.readouterr().err
+    assert 'PSF field' in shown and 'all stars' in shown
+    fitted()
+    assert capsys.readouterr().err == ''
+
+
 @pytest.mark.parametrize('share', [0.02, 0.05])
 def test_light_in_the_wrong_pixels_is_noticed(share):
     assert fitted(misfit=share).accuracy == pytest.approx(share, rel=0.25)
