@@ -51,8 +51,7 @@ def main(argv=None):
     parser = make_parser()
     words = sys.argv[1:] if argv is None else list(argv)
     if not words:
-        parser.print_help(sys.stderr)
-        return 2
+        parser.exit(2, parser.format_help())
     options, unknown = parser.parse_known_args(words)
     if unknown:
         options.parser.error(_unknown(options.parser, unknown))

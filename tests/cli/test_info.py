@@ -55,7 +55,9 @@ def test_info_says_that_a_text_is_none_of_the_files(folder, capsys):
 
 
 def test_without_a_command_there_is_help(capsys):
-    assert main([]) == 2
+    with pytest.raises(SystemExit) as stop:
+        main([])
+    assert stop.value.code == 2
     assert 'mgauss photometry night1.fits' in capsys.readouterr().err
 
 
