@@ -321,7 +321,9 @@ def instruments():
             'prnu': .01, 'hot_pixels': .01, 'dead_pixels': .01,
             'hot_dark': 5.0, 'bad_columns': 1, 'cosmic_rays': 1.0,
             'nonlinearity': 1e-6, 'charge_diffusion': .3,
-            'brighter_fatter': 1e-6}),
+            'brighter_fatter': 1e-6, 'large_scale_flat': .01,
+            'flat_error': .001, 'shutter': 1.0, 'warm_pixels': .01,
+            'warm_dark': .3}),
         'Exposure': (mg.Exposure, {
             'time': Time('2026-01-01'), 'band': 'g', 'ra': 10.0, 'dec': 20.0,
             'rotation': 0.0, 'scale': 1.0, 'distortion': None, 'detector': 1,
@@ -333,6 +335,9 @@ def instruments():
         'paper_exposures': (mg.paper_exposures, {
             'ra': 10.0, 'dec': 20.0, 'offset': 3.0, 'rotation': .05,
             'scale': 1e-4, 'distortion': .5, 'rng': 2}),
+        'paper_scene': (mg.paper_scene, {
+            'field': 'ngp', 'shape': SHAPE, 'epoch': 3, 'psf': None,
+            'effects': None, 'rng': 1}),
     }
 
 
