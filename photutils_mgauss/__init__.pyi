@@ -1006,7 +1006,7 @@ def fit_mixture_field(
     pixel_integrated: Literal['auto'] | bool = 'auto',
     correlated_noise: bool = True, contexts: Sequence[str] = (),
     brighter_fatter: bool | Literal['auto'] = False,
-    executor: Executor | None = None,
+    executor: Executor | None = None, progress_bar: bool = False,
 ) -> MixtureField: ...
 
 def inject_and_recover(

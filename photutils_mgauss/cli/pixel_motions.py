@@ -94,6 +94,10 @@ def _check(options):
         msg = ('--pixels must be given without --plane, --parallax-of and '
                '--references; the frames come from --frames')
         raise ValueError(msg)
+    if options.frames is not None and not Path(options.frames).is_dir():
+        msg = (f'--frames must be the output folder of mgauss motions, got '
+               f'{options.frames}')
+        raise ValueError(msg)
     tools.check_inputs([*options.inputs, *options.psf, options.targets])
     tools.check_different(options.inputs)
     check_observer(options.observer, len(options.inputs))

@@ -439,7 +439,8 @@ def test_a_report_of_something_else_is_an_error(chain, capsys):
 @pytest.mark.parametrize('arguments', [
     [], ['nonsense'], ['demo', '--epochs', '1'], ['demo', '--size', 'big'],
     ['photometry', 'a.fits'], ['psf', 'a.fits', '--gain', '-1'],
-    ['motions'], ['report', 'a', '--unknown']])
+    ['motions'], ['motions', 'a', 'b', '--transform', 'round'],
+    ['report', 'a', '--unknown']])
 def test_wrong_usage_exits_with_2(arguments, capsys):
     with pytest.raises(SystemExit) as stop:
         main(arguments)

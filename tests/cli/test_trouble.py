@@ -191,7 +191,6 @@ def no_work(monkeypatch):
 
 @pytest.mark.usefixtures('no_work')
 @pytest.mark.parametrize(('words', 'said'), [
-    ('motions 1.fits 2.fits --transform round', 'transform'),
     ('motions 1.fits 2.fits --references 1.fits', '1.fits: must be a table'),
     ('motions 1.fits 2.fits --references 1_cat.ecsv', 'ref_epoch'),
     ('motions 1_cat.ecsv 1_cat.ecsv', '1_cat.ecsv: must be given only once'),

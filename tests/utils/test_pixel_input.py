@@ -203,8 +203,8 @@ def no_sampling(monkeypatch):
         found.pixels = data.values
         found.errors = [] if data.error is None else data.error
         return found
-    monkeypatch.setattr(posterior, '_build', lambda data: data)
-    monkeypatch.setattr(posterior, '_sample', sample)
+    monkeypatch.setattr(posterior, 'build_model', lambda data: data)
+    monkeypatch.setattr(posterior, 'sample', sample)
 
 
 # Each form takes plain data, error and mask and returns arguments.
