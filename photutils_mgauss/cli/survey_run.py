@@ -207,8 +207,14 @@ def local_workers(number):
 
 def _begin(cores):
     """Prepare a process: so many cores, and an end with who started it."""
+    from threadpoolctl import threadpool_limits
+
     from photutils_mgauss.utils.parallel import limit_cores
     limit_cores(cores)
+    # Threads of linear algebra too: of what is loaded, and of what will be.
+    threadpool_limits(cores, user_api='blas')
+    for name in ('OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
+        os.environ[name] = str(cores)
     Thread(target=_end_with_parent, daemon=True).start()
 
 
