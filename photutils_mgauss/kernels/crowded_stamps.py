@@ -28,7 +28,8 @@ class Gaussians(NamedTuple):
     The PSF of each of n stars, as Gaussians.
 
     Star i's are the first count[i] of rows[i] (n, K, 6); strides (n, K, 4) is
-    as of `psf.rows.strides`, integrated whether pixels are integrated over.
+    as of `psf.rows.strides`, integrated whether pixels are integrated over,
+    None if not.
     """
 
     rows: np.ndarray

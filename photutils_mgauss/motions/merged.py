@@ -16,7 +16,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from photutils_mgauss.motions.tables import GAIA
+from photutils_mgauss.motions.tables import GAIA, RELATIVE
 from photutils_mgauss.utils.star_columns import column_values
 
 _MAS = np.pi / 180 / 3600e3
@@ -25,8 +25,6 @@ _MAS = np.pi / 180 / 3600e3
 _FARTHEST, _SIGMAS = 1000.0, 5.0
 # The variance of what a solution does not know.
 _UNKNOWN = 1e12
-# Motions relative to the mean of a field's own stars have no common frame.
-_RELATIVE = 256
 
 
 def merge_stars(tables, references=None):
@@ -110,7 +108,8 @@ class _Stars:
         self.covariance[unknown, 2, :] = self.covariance[unknown, :, 2] = 0
         self.covariance[unknown, 2, 2] = _UNKNOWN
         self.parallax[unknown] = 0
-        relative = column('flags', None).astype(int) & _RELATIVE
+        # The mean of a field's own stars is no frame that others have.
+        relative = column('flags', None).astype(int) & RELATIVE
         self.usable = (np.isfinite(self.covariance).all(axis=(1, 2))
                        & np.isfinite(self.ra + self.dec + self.year
                                      + self.motion.sum(axis=1))

@@ -13,6 +13,9 @@ from photutils_mgauss.motions.stacked import invert_2x2
 from photutils_mgauss.sky.tangent_plane import directions
 from photutils_mgauss.utils.star_columns import words_column
 
+# The bit of a star whose motion is relative to its own field.
+RELATIVE = 256
+
 # What each bit of a star's flags means.
 FLAGS = {
     1: ('no_solution: too few detections, or too short a time, for the '
@@ -30,7 +33,7 @@ FLAGS = {
     128: ('parallax_correlated: no parallax was fitted, and parallax and '
           'motion would correlate by more than 0.3: a parallax biases the '
           'motion'),
-    256: 'relative: motions are relative to the mean of the stars',
+    RELATIVE: 'relative: motions are relative to the mean of the stars',
     512: ('inconsistent: the detections do not agree with one straight '
           'motion; the star was not used to tie the frames'),
     65536: ('not_converged: the fit to the pixels did not come to its end'),
@@ -249,7 +252,7 @@ def _flags(fit):
         32: np.isin(stars, state.dropped),
         64: np.isin(stars, fit.setup.held),
         512: state.untied,
-        256: np.full(len(solved), relative),
+        RELATIVE: np.full(len(solved), relative),
     }
     return sum(bit * mark.astype(int) for bit, mark in marks.items()), solved
 
