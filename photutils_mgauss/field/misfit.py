@@ -15,8 +15,11 @@ that,
 
 is the covariance of z where all light is right, V being that of the shapes
 there, and :math:`C + \epsilon^2\, C D C` is what it is otherwise, D holding
-:math:`L_i^2` over the variance. The sum of :math:`D_i z_i^2` of each star says
-how large :math:`\epsilon` is: the most likely one is taken.
+:math:`L_i^2` over the variance. Rings lack more of their light than cores do,
+but it is cores that have the places of stars. So the sum of
+:math:`h_i z_i^2` of each star says how large :math:`\epsilon` is, where
+:math:`h_i` is by how much (:math:`x^2 + y^2`) the star moves if the light of
+pixel i alone is off; the most likely :math:`\epsilon` is taken.
 """
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -127,6 +130,9 @@ def _sums(residual, light, own, by_shapes, covariance):
     free = by_shapes - (by_shapes @ axes) @ axes.T
     matrix = (np.eye(light.size) - axes @ axes.T
               - free.T @ covariance @ free)
-    weight = light**2
+    square = light**2
+    # Rows are flux, x, y: what a residual of one does to each of them.
+    moves = np.linalg.pinv(own.T)[1:3]
+    weight = (moves**2).sum(axis=0) * square
     return (weight @ residual**2, weight @ np.diag(matrix),
-            weight @ matrix**2 @ weight)
+            weight @ matrix**2 @ square)

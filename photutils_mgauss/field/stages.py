@@ -39,7 +39,9 @@ _MAX_DEVIANT_PIXELS = 0.1
 _ADAPTATIONS = 3
 # Of a unit pixel along either axis [pix^2].
 PIXEL_VARIANCE = 1 / 12
-# Relative error of the PSF assumed before anything is known of it.
+# Relative error of the PSF assumed before anything is known of it, and at
+# most in the weights: cores would lose theirs to wings where few Gaussians
+# err more, which makes these wider, so that they err more, and so on upwards.
 _FIRST_ACCURACY = 0.1
 # What few Gaussians may lack of coarse optics in any pixel, as a share of a
 # star's flux. The many faint pixels of rings would otherwise decide what the
@@ -297,8 +299,8 @@ def weigh(state, *, reject, share=1.0):
     if residual is not None and share is not None:
         state.accuracy = share * _accuracy(residual, light, variance,
                                            problem)
-    variance = (variance + (state.accuracy * light) ** 2
-                + _lacking(state, light))
+    forgiven = min(state.accuracy, _FIRST_ACCURACY)
+    variance = variance + (forgiven * light) ** 2 + _lacking(state, light)
     if reject and residual is not None:
         _reject(state, residual, variance + (_ALLOWANCE * light) ** 2)
     problem.weights = np.where(good & ~state.deviant_pixels, 1 / variance, 0)

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from numpy.testing import assert_allclose
+from scipy.optimize import least_squares
 
 from photutils_mgauss import (
     EmpiricalPSF,
@@ -163,3 +164,52 @@ def test_lists_that_do_not_fit_are_errors(exposures, change, text):
 def test_an_exposure_that_does_not_exist_is_an_error(field):
     with pytest.raises(ValueError, match='exposure must be below 3, got 3'):
         field.mixture_at(1, 1, exposure=3)
+
+
+GAMMAS = 2.0, 2.6
+
+
+def moffat(r2, gamma):
+    return 1.5 / (np.pi * gamma**2) * (1 + r2 / gamma**2) ** -2.5
+
+
+@pytest.fixture(scope='module')
+def seeing():
+    """Return data, stars and error of two exposures of Moffat profiles."""
+    rng = np.random.default_rng(4)
+    y, x = np.indices((100, 100))
+    found = [], [], []
+    for gamma in GAMMAS:
+        stars = Table({'x': rng.uniform(8, 92, 12),
+                       'y': rng.uniform(8, 92, 12),
+                       'flux': rng.uniform(2e4, 6e4, 12)})
+        clean = sum(flux * moffat((x - x_0)**2 + (y - y_0)**2, gamma)
+                    for x_0, y_0, flux in stars.iterrows())
+        for images, one in zip(found, (rng.poisson(clean + 30) - 30.0, stars,
+                                       np.sqrt(clean + 30)), strict=True):
+            images.append(one)
+    return found
+
+
+def gaussian_of(gamma, accuracy):
+    """Return the variance of the Gaussian nearest to a Moffat profile."""
+    y, x = np.mgrid[-6:7, -6:7]
+    r2 = (x**2 + y**2)[x**2 + y**2 <= 36]
+    star = 4e4 * moffat(r2, gamma)
+    error = np.sqrt(star + 30 + (accuracy * star) ** 2)
+    return least_squares(lambda p: (
+        p[0] / (2 * np.pi * p[1]) * np.exp(-r2 / (2 * p[1])) - star) / error,
+        [4e4, 2.0]).x[1]
+
+
+@pytest.mark.parametrize('which', [[0], [1], [0, 1]])
+def test_one_gaussian_stays_near_the_core_of_a_psf_with_wings(seeing, which):
+    # A model that errs much may not give its cores so little weight that
+    # wings take it over.
+    data, stars, error = ([one[i] for i in which] for one in seeing)
+    field = fit_mixture_field(data, stars, error=error, n_components=1,
+                              degree=0, radius=6, normalise='stamps')
+    for number, i in enumerate(which):
+        found = field.mixture_at(50, 50, exposure=number).covariances[0]
+        assert gaussian_of(GAMMAS[i], 0) < np.trace(found) / 2 < (
+            1.05 * gaussian_of(GAMMAS[i], 0.1))
