@@ -16,6 +16,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import (
     core_width,
+    covariance_of,
     residual_stars,
     star_table,
 )
@@ -37,7 +38,7 @@ from photutils_mgauss.field.input import (
     read_exposures,
     read_sample,
 )
-from photutils_mgauss.field.misfit import misfit
+from photutils_mgauss.field.misfit import misfit, softened_covariance
 from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.field.normal import Workers, model_stamps
 from photutils_mgauss.field.options import FieldOptions
@@ -369,6 +370,9 @@ def _tuned(fit, sample, start, radius, centre):
 def _result(fit, sample, radius, choice, centre, fatter):
     sample = sample.without_deviant(fit.problem.used)
     covariance, unmodelled = honest_covariance(fit)
+    if fit.lack:
+        covariance = covariance + (softened_covariance(fit)
+                                   - covariance_of(fit))
     n_terms = len(fit.coefficients) - fit.problem.n_extra
     field = MixtureField(
         fit.coefficients[:n_terms], sample.shape, radius, covariance, None,

@@ -27,7 +27,7 @@ from scipy.optimize import minimize_scalar
 from photutils_mgauss import kernels
 from photutils_mgauss.field.base import covariance_of
 from photutils_mgauss.field.covariance import shape_covariance
-from photutils_mgauss.field.normal import model_stamps
+from photutils_mgauss.field.normal import model_stamps, to_vector
 from photutils_mgauss.psf.rows import kernel_rows_of_logs
 
 # How far from the middle pixel of a star pixels are looked at: there is all
@@ -72,6 +72,55 @@ def misfit(fit):
                      for i, each in enumerate(covariances)])
     found, expected, response = sums[sums[:, 1] > 0].T
     return _most_likely(found, expected, response)
+
+
+def softened_covariance(fit):
+    """
+    Return the covariance of coefficients fitted under softened weights.
+
+    What Gaussians may lack is part of the weights but no noise: the inverse
+    of the normal equations counts it as such.
+
+    Parameters
+    ----------
+    fit : FieldFit
+        Its accuracy that of the light in pixels.
+
+    Returns
+    -------
+    (N, N) `~numpy.ndarray`
+    """
+    problem = fit.problem
+    light = model_stamps(problem, fit.coefficients) - problem.sky[:, None,
+                                                                  None]
+    light = np.maximum(light, 0)
+    variance = (problem.stamps.base + problem.stamps.slope * light
+                + (fit.accuracy * light) ** 2)
+    shapes = problem.shapes(fit.coefficients)
+    noise = np.diag(to_vector(fit.prior.precision))
+    for star in np.flatnonzero(problem.used):
+        noise += np.kron(
+            _gradient_covariance(problem, star, shapes[star], variance[star]),
+            np.outer(problem.basis[star], problem.basis[star]))
+    covariance = covariance_of(fit)
+    return covariance @ noise @ covariance
+
+
+def _gradient_covariance(problem, star, shapes, variance):
+    """Return the covariance (P, P) of the gradient of a star's shapes."""
+    inside = problem.weights[star] > 0
+    row, column = np.nonzero(inside)
+    x, y, flux = problem.sources[star, 0]
+    left, bottom = problem.stamps.corners[star]
+    _, own, by_shapes = _derivatives(left + column - x, bottom + row - y,
+                                     shapes, flux)
+    if problem.fit_sky:
+        own = np.vstack([own, np.ones(row.size)])
+    root = np.sqrt(problem.weights[star][inside])
+    axes, _ = np.linalg.qr((own * root).T)
+    free = by_shapes * root
+    free = (free - (free @ axes) @ axes.T) * root * np.sqrt(variance[inside])
+    return free @ free.T
 
 
 def _most_likely(found, noise, response):

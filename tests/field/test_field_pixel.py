@@ -16,12 +16,16 @@ from photutils_mgauss import (
 )
 from photutils_mgauss.field.base import core_width
 from photutils_mgauss.field.forms import FreeShapes
+from photutils_mgauss.field.misfit import softened_covariance
 from photutils_mgauss.field.normal import (
     FieldProblem,
+    Prior,
     Workers,
     equations,
     to_coefficients,
+    to_vector,
 )
+from photutils_mgauss.field.stages import FieldFit
 from photutils_mgauss.field.stamps import Stamps
 from photutils_mgauss.psf.errors import PSFErrors
 from photutils_mgauss.psf.grid import Grid
@@ -284,3 +288,38 @@ def test_the_slope_of_chi2_is_the_right_side_of_the_equations():
             step[i] = 1e-4
             slope = (chi2(step)[0] - chi2(-step)[0]) / 2e-4
             assert_allclose(-2 * right[i], slope, rtol=2e-3, atol=0.1)
+
+
+def two_stars(weight):
+    """Return a fit of two stars of unit noise whose pixels have a weight."""
+    data = np.array([OPTICS.render((13, 13), *place, flux=3000,
+                                   pixel_integrated=True)
+                     for place in ((6.1, 5.8), (5.7, 6.3))])
+    flat = np.ones(data.shape)
+    sources = np.array([[[6.1, 5.8, 3000]], [[5.7, 6.3, 3000]]])
+    coefficients = np.zeros((2, 2, 6))
+    coefficients[0, :, 3::2] = [[0.9, 0.9], [0.2, 0.3]]
+    problem = FieldProblem(
+        Stamps(data, flat, flat > 0, np.zeros((2, 2)), np.zeros((2, 1, 1))),
+        weight * flat, np.column_stack([np.ones(2), [-1, 0.5]]), sources,
+        sources.copy(), np.zeros(sources.shape), np.ones(2, int),
+        np.zeros(2), True, np.ones(2, bool), np.zeros(2, int), FreeShapes(),
+        np.zeros((2, 3)), pixel_integrated=True)
+    with Workers() as workers:
+        for _ in range(12):
+            found = equations(problem, coefficients, workers)
+            problem.sources, problem.sky = found.sources, found.sky
+    return FieldFit(problem, coefficients,
+                    Prior.about(coefficients[0], 2, 1.0), found, 0.0,
+                    flat < 0)
+
+
+@pytest.mark.parametrize('weight', [1.0, 0.25])
+def test_softened_weights_are_no_noise(weight):
+    fit, plain = two_stars(weight), two_stars(1.0)
+    prior = np.diag(to_vector(fit.prior.precision))
+    # The noise of the gradient of chi^2 / 2 under any weights.
+    noise = weight**2 * plain.equations.matrix + prior
+    inverse = np.linalg.inv(weight * plain.equations.matrix + prior)
+    assert_allclose(softened_covariance(fit), inverse @ noise @ inverse,
+                    rtol=1e-5, atol=1e-9)
