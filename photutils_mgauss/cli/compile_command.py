@@ -22,13 +22,14 @@ def add(commands):
 def run(options):
     """Compile everything and say what was done."""
     start = time.perf_counter()
-    ready, folder = set(), None
+    ready, kept = set(), None
     for words, seconds, names, folder in compile_all():
         ready.update(names)
+        kept = folder
         tools.say(options, f'{words:40} {seconds:6.1f} s')
     total = time.perf_counter() - start
     tools.say(options, f'{len(ready)} functions ready in {total:.1f} s, '
-              + (f'kept in {folder}' if folder else 'not kept: no folder for '
+              + (f'kept in {kept}' if kept else 'not kept: no folder for '
                  'them can be written, see NUMBA_CACHE_DIR'))
 
 
