@@ -22,9 +22,7 @@ from photutils.psf import PSFPhotometry
 
 from photutils_mgauss.photometry import engine
 from photutils_mgauss.photometry import table as _table
-from photutils_mgauss.photometry.aperture_correction import (
-    aperture_correction,
-)
+from photutils_mgauss.photometry.apertures import aperture_correction
 from photutils_mgauss.photometry.bright_residual import without_residual
 from photutils_mgauss.photometry.contexts import (
     context_columns,
