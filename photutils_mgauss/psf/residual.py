@@ -47,6 +47,8 @@ FEWEST, _FEW, _MOST = 5, 30, 300
 _SIGNIFICANT = 4.0
 # Pixels further off than so many standard errors hold something else.
 _CLIP, _PASSES = 4.0, 3
+# The level of the sky is known to this part of a pixel's noise beforehand.
+_SKY = 0.1
 # Beyond the radius it fades, and ends at so many times that.
 _END = 1.25
 
@@ -222,8 +224,10 @@ class _Samples:
         # Of what a level would look like what terms could be does not count.
         own = self.level - self.read(
             self._fitted(weight, self.level, self._inverse(weight)))
-        total = (weight * own * self.level).sum()
-        return (weight * own * self.value).sum() / total if total > 0 else 0.0
+        # Stars of one flux tell nothing of it.
+        noise = np.median(np.sqrt(self.variance) / self.level)
+        total = (weight * own * self.level).sum() + (_SKY * noise)**-2
+        return (weight * own * self.value).sum() / total
 
     @property
     def n_rings(self):
