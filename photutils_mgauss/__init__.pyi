@@ -76,6 +76,7 @@ class CrowdedMixturePhotometry:
         xy_bounds: float | None = 1.0,
         checkpoint: str | PathLike[str] | None = None, psf_errors: bool = True,
         confusion: bool = True, saturation: float | Quantity | None = None,
+        residual_radius: float | None = None,
     ) -> None: ...
     def __call__(
         self, data: ArrayLike | NDData, *, mask: ArrayLike | None = None,
@@ -572,7 +573,8 @@ class MixturePSFPhotometry(PSFPhotometry):
         variance: Literal['model', 'data'] = 'model', xy_cov: bool = False,
         psf_errors: bool = True, correlated_noise: bool = True,
         aperture_radius_correction: float | None = None,
-        saturation: float | Quantity | None = None, **kwargs: Any,
+        saturation: float | Quantity | None = None,
+        residual_radius: float | None = None, **kwargs: Any,
     ) -> None: ...
     def __call__(
         self, data: ArrayLike | NDData, *, mask: ArrayLike | None = None,

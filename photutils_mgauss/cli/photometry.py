@@ -61,6 +61,10 @@ def add_measuring(parser):
     group.add_argument('--fit-shape', type=tools.count, default=11,
                        metavar='PIXELS', help='side of the fitted region, '
                        'odd (default: %(default)s)')
+    group.add_argument('--residual-radius', type=tools.positive,
+                       metavar='PIXELS', help='measure what the PSF leaves '
+                       'of bright stars, such as spikes, out to here, and '
+                       'take it off them')
     group.add_argument('--magnitudes', action='store_true',
                        help='add AB magnitudes; for images in MJy/sr or a '
                             'unit of flux density')
@@ -173,7 +177,8 @@ def _sparse(image, psf, options):
     photometry = MixturePSFPhotometry(
         psf, options.fit_shape, finder=finder,
         aperture_radius=max(2.0, 1.5 * fwhm), effective_gain=noise.gain,
-        xy_cov=True, saturation=image.saturation_without_sky)
+        xy_cov=True, saturation=image.saturation_without_sky,
+        residual_radius=options.residual_radius)
     return photometry(image.without_sky, error=noise.background,
                       mask=image.mask)
 
@@ -185,7 +190,8 @@ def _crowded(image, psf, options):
     photometry = CrowdedMixturePhotometry(
         psf, threshold=options.threshold or 4.5,
         effective_gain=image.noise.gain, checkpoint=options.checkpoint,
-        saturation=image.saturation)
+        saturation=image.saturation,
+        residual_radius=options.residual_radius)
     return photometry(image.data, error=image.noise.total, mask=image.mask)
 
 

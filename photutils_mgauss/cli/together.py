@@ -51,6 +51,9 @@ def _check(options):
     if options.magnitudes:
         msg = '--together must be given without --magnitudes'
         raise ValueError(msg)
+    if options.residual_radius is not None:
+        msg = '--together must be given without --residual-radius'
+        raise ValueError(msg)
     name = Path(options.output or _NAME)
     if name.suffix not in _SUFFIXES:
         msg = (f'--output must be a file {" or ".join(_SUFFIXES)} with '

@@ -11,16 +11,19 @@ import numpy as np
 from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss.crowded.plan import Plan, run
+from photutils_mgauss.crowded.residual import (
+    nearest_background,
+    without_residual,
+)
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.crowded.table import (
-    NO_COVARIANCE,
-    NO_OVERLAP,
     as_qtable,
+    in_given_order,
     no_stars,
     positions,
 )
 from photutils_mgauss.crowded.tile import TileOptions
-from photutils_mgauss.crowded.unfinished import UnfinishedTilesError
+from photutils_mgauss.crowded.unfinished import Solved
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.psf.star_errors import add_psf_errors
@@ -29,7 +32,7 @@ from photutils_mgauss.utils.flags import REPEATED, decode
 from photutils_mgauss.utils.image import read_pixels, with_unit
 from photutils_mgauss.utils.per_thread import PerThread, keep
 from photutils_mgauss.utils.saturation import as_saturation, without_saturated
-from photutils_mgauss.utils.star_columns import column_values, read_sources
+from photutils_mgauss.utils.star_columns import read_sources
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
 
 __all__ = ['CrowdedMixturePhotometry']
@@ -120,6 +123,13 @@ class CrowdedMixturePhotometry:
         If given, such pixels are masked, with the trails along rows and
         columns that their charge has run into and a pixel around them. Stars
         behind masked pixels are fitted to their wings in any case.
+    residual_radius : float, optional
+        If given, spikes, rings and ghosts of bright stars that the PSF does
+        not have are measured on the image, out to this distance [pix] and
+        fading beyond it, as `MixturePSFPhotometry` does it: what is left of
+        bright stars once all stars are fitted. It is taken off all of them
+        and the image solved again, in twice the time. A warning says if
+        there are too few stars. Not in `fit_images`.
     find_neighbors : bool, optional
         Whether stars that are missing from a given list are found and fitted
         together with those on it. They are not reported. Otherwise the list
@@ -136,6 +146,9 @@ class CrowdedMixturePhotometry:
     field : MixtureField or None
         The PSF that was made of the stars of the last image, if
         ``psf_model`` is None.
+    psf_residual : PSFResidual or None
+        What the PSF leaves of bright stars, if it was measured in the last
+        call; its ``image(x, y, flux)`` draws that of some stars.
     psf_used : GriddedMixturePSF or MultiGaussianPSFModel
         The PSF of the last table, ``psf_model`` unless that is None.
 
@@ -187,6 +200,7 @@ class CrowdedMixturePhotometry:
     results = PerThread('The table of the last call.')
     field = PerThread('The PSF made of the stars of the last image.')
     psf_used = PerThread('The PSF of the last table.')
+    psf_residual = PerThread('What the PSF leaves of bright stars.')
     _noise = PerThread('The noise of a pixel of the last image.')
 
     def __init__(self, psf_model, *, threshold=4.5, keep=2.0, depth=3.5,
@@ -194,7 +208,8 @@ class CrowdedMixturePhotometry:
                  effective_gain=None, maxiters=3, tile_shape=None,
                  overlap=128, executor=None, progress_bar=False,
                  find_neighbors=True, xy_bounds=1.0, checkpoint=None,
-                 psf_errors=True, confusion=True, saturation=None):
+                 psf_errors=True, confusion=True, saturation=None,
+                 residual_radius=None):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
         self.keep = as_real(keep, 'keep', minimum=0)
@@ -222,7 +237,10 @@ class CrowdedMixturePhotometry:
             self.xy_bounds = as_real(xy_bounds, 'xy_bounds', above=0)
         self.checkpoint = checkpoint
         self._checkpoint = Checkpoint(checkpoint)
-        self.results = self.field = None
+        self.results = self.field = self.psf_residual = None
+        self.residual_radius = (
+            None if residual_radius is None
+            else as_real(residual_radius, 'residual_radius', minimum=3))
         self._noise = np.inf
         self.psf_errors = bool(psf_errors)
         self.confusion = bool(confusion)
@@ -278,20 +296,31 @@ class CrowdedMixturePhotometry:
                  else self._listed(init_params, image.unit))
         psf = self._psf_of(image)
         options = self._options(image)
+        solved = self._solve(image, psf, options, given)
+        known = None
+        if self.residual_radius is not None and not solved.unfinished:
+            image, known = without_residual(
+                image, self.psf_used, solved.table, self.residual_radius)
+            if known is not None:
+                solved = self._solve(image, psf, options, given)
+        if self.psf_errors:
+            add_psf_errors(solved.table, image, self.psf_used,
+                           executor=self.executor)
+        keep(self, results=solved.table, psf_residual=known,
+             _noise=options.noise)
+        solved.check()
+        return solved.table
+
+    def _solve(self, image, psf, options, given):
+        """Return the `Solved` image."""
         plan = Plan(image, psf, options, self.tile_shape, self.overlap,
                     given, self._checkpoint)
         outcomes, errors = run(plan, self.executor, self.progress_bar)
         unfinished = [core for core, outcome in zip(plan.cores, outcomes,
                                                     strict=True)
                       if outcome is None]
-        table = self._table(outcomes, given, image.unit)
-        if self.psf_errors:
-            add_psf_errors(table, image, self.psf_used,
-                           executor=self.executor)
-        keep(self, results=table, _noise=options.noise)
-        if unfinished:
-            raise UnfinishedTilesError(unfinished, table) from errors[0]
-        return table
+        return Solved(self._table(outcomes, given, image.unit), unfinished,
+                      errors)
 
     def fit_images(self, images, stars=None, *, motions=False):
         """
@@ -356,13 +385,16 @@ class CrowdedMixturePhotometry:
         >>> len(table), table['flux'].shape
         (1, (1, 2))
         """
+        if self.residual_radius is not None:
+            msg = ('residual_radius must be None for fit_images, got '
+                   f'{self.residual_radius:g}')
+            raise ValueError(msg)
         from photutils_mgauss.crowded.many_images import Settings, fit_images
         table, unfinished, errors = fit_images(images, stars, Settings(
             self._options, self._model_of, self._bound, self.tile_shape,
             self.overlap, self.executor, self.progress_bar,
             self._checkpoint), motions=motions)
-        if unfinished:
-            raise UnfinishedTilesError(unfinished, table) from errors[0]
+        Solved(table, unfinished, errors).check()
         return table
 
     def _psf_of(self, image):
@@ -444,7 +476,7 @@ class CrowdedMixturePhotometry:
         meta = self._report(done, stars)
         del done
         if given is not None:
-            stars = _in_given_order(stars, given)
+            stars = in_given_order(stars, given)
         else:
             stars.sort('y', 'x')
         if self.confusion:
@@ -462,7 +494,7 @@ class CrowdedMixturePhotometry:
             word = 'narrow' if width > 0 else 'wide'
             warnings.warn(f'the PSF is too {word}: the variance of the light '
                           f'of bright stars differs by {width:+.0%}',
-                          AstropyUserWarning, stacklevel=4)
+                          AstropyUserWarning, stacklevel=5)
         return {'n_stars': len(stars), 'reduced_chi2': chi2,
                 'psf_size_difference': width}
 
@@ -529,7 +561,7 @@ class CrowdedMixturePhotometry:
         image = MixtureRenderer(self.psf_used).image(
             stars, _FAINTEST * self._noise, shape, window)
         if include_local_bkg and len(table):
-            image += _nearest_background(table, shape)
+            image += nearest_background(table, shape)
         return with_unit(image, getattr(table['flux_fit'], 'unit', None))
 
     def make_residual_image(self, data, *, psf_shape=None,
@@ -558,30 +590,3 @@ def _given(table, unit):
     """Return x, y, flux (NaN if unknown) and the row of each position."""
     found = read_sources(table, 'init_params', first='_init', unit=unit)
     return found.x, found.y, found.flux, np.arange(len(table))
-
-
-def _in_given_order(stars, given):
-    """Return one row for each position; NaN where nothing was fitted."""
-    n = len(given)
-    columns = {}
-    for name, column in vars(stars).items():
-        fill = np.nan if column.dtype.kind == 'f' else 0
-        columns[name] = np.full(n, fill, column.dtype)
-        columns[name][stars.number] = column
-    missing = np.ones(n, bool)
-    missing[stars.number] = False
-    columns['flags'][missing] |= NO_COVARIANCE | NO_OVERLAP
-    columns['flux_init'] = np.where(np.isfinite(given.flux), given.flux,
-                                    columns['flux_init'])
-    return Stars.of_columns(columns).replaced(x_init=given.x, y_init=given.y)
-
-
-def _nearest_background(table, shape):
-    from scipy.spatial import cKDTree
-    level = column_values(table, 'local_bkg')
-    good = np.isfinite(level) & np.isfinite(table['x_fit'])
-    tree = cKDTree(np.column_stack([table['x_fit'][good],
-                                    table['y_fit'][good]]))
-    y, x = np.indices(shape)
-    nearest = tree.query(np.column_stack([x.ravel(), y.ravel()]))[1]
-    return level[good][nearest].reshape(shape)

@@ -225,3 +225,19 @@ def positions(table):
     """Return x, y and flux of the stars of a table."""
     return tuple(column_values(table, name)
                  for name in ('x_fit', 'y_fit', 'flux_fit'))
+
+
+def in_given_order(stars, given):
+    """Return one row for each position; NaN where nothing was fitted."""
+    n = len(given)
+    columns = {}
+    for name, column in vars(stars).items():
+        fill = np.nan if column.dtype.kind == 'f' else 0
+        columns[name] = np.full(n, fill, column.dtype)
+        columns[name][stars.number] = column
+    missing = np.ones(n, bool)
+    missing[stars.number] = False
+    columns['flags'][missing] |= NO_COVARIANCE | NO_OVERLAP
+    columns['flux_init'] = np.where(np.isfinite(given.flux), given.flux,
+                                    columns['flux_init'])
+    return Stars.of_columns(columns).replaced(x_init=given.x, y_init=given.y)

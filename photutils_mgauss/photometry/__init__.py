@@ -24,6 +24,6 @@ __getattr__, __dir__, __all__ = hand_on(__name__, {
     'pixel_error': 'noise',
     'pixel_phase_error': 'pixel_phase',
     'PixelPhaseError': 'pixel_phase',
-    'aperture_correction': 'psf_photometry',
+    'aperture_correction': 'apertures',
     'MixturePSFPhotometry': 'psf_photometry',
 })

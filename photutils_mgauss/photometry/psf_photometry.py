@@ -22,6 +22,8 @@ from photutils.psf import PSFPhotometry
 
 from photutils_mgauss.photometry import engine
 from photutils_mgauss.photometry import table as _table
+from photutils_mgauss.photometry.apertures import aperture_correction
+from photutils_mgauss.photometry.bright_residual import without_residual
 from photutils_mgauss.photometry.contexts import (
     context_columns,
     fit_with_contexts,
@@ -32,7 +34,6 @@ from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
 from photutils_mgauss.photometry.saturated import (
     SaturatedStars,
     flag,
-    with_measured_wings,
     with_misfit,
 )
 from photutils_mgauss.utils import compat
@@ -111,6 +112,14 @@ class MixturePSFPhotometry(PSFPhotometry):
         say they are, in as many pixels as that takes, and have bit 65536 in
         ``flags``. Their errors grow by the root of ``reduced_chi2`` where it
         is above one.
+    residual_radius : float, optional
+        If given, spikes, rings and ghosts of bright stars that the PSF does
+        not have are measured on the image, out to this distance [pix] and
+        fading beyond it: the mean of what is left of all bright stars, as
+        far as it stands out of noise. It is taken off each of them, and all
+        stars are fitted again. What was measured is ``psf_residual``; a
+        warning says if there are too few stars. Not for a PSF that depends
+        on colours or fluxes, nor for one that is left to photutils.
     aperture_radius_correction : float, optional
         If given, adds the column ``aperture_correction``: what to multiply a
         flux measured within this radius [pix] by, the inverse of the PSF's
@@ -128,6 +137,9 @@ class MixturePSFPhotometry(PSFPhotometry):
         threads may call one object; each sees its own last call.
     init_params : `~astropy.table.QTable`
         The initial parameters.
+    psf_residual : PSFResidual or None
+        What the PSF leaves of bright stars, if it was measured in the last
+        call; its ``image(x, y, flux)`` draws that of some stars.
     fit_info : list of dict
         ``param_cov`` (covariance of the free parameters, in the order flux,
         x, y), ``status`` and ``message`` of each star, in the order of
@@ -159,13 +171,15 @@ class MixturePSFPhotometry(PSFPhotometry):
     finder_results = PerThread('What the finder found in the last call.')
     init_params = PerThread('Where the fits of the last call started.')
     results = PerThread('The table of the last call.')
+    psf_residual = PerThread('What the PSF leaves of bright stars.')
     _fit_info = PerThread('How the fits of the last call went.')
 
     def __init__(self, psf_model, fit_shape, *, fitter=None, executor=None,
                  n_threads=None, fit_sky=False, effective_gain=None,
                  variance='model', xy_cov=False, psf_errors=True,
                  correlated_noise=True,
-                 aperture_radius_correction=None, saturation=None, **kwargs):
+                 aperture_radius_correction=None, saturation=None,
+                 residual_radius=None, **kwargs):
         fitter = MixtureFitter() if fitter is None else fitter
         if n_threads is not None and compat.HAS_THREADS:
             kwargs['n_threads'] = n_threads
@@ -189,6 +203,10 @@ class MixturePSFPhotometry(PSFPhotometry):
         self.xy_cov = bool(xy_cov)
         self.saturation = as_saturation(saturation)
         self._saturated = SaturatedStars()
+        self.residual_radius = (
+            None if residual_radius is None
+            else as_real(residual_radius, 'residual_radius', minimum=3))
+        self.psf_residual = None
         self.aperture_radius_correction = (
             None if aperture_radius_correction is None
             else as_real(aperture_radius_correction,
@@ -229,12 +247,14 @@ class MixturePSFPhotometry(PSFPhotometry):
         finally:
             keep(self, **{name: getattr(call, name)
                           for name in compat.OF_A_CALL if name != 'fit_info'},
-                 _fit_info=call._fit_info)
+                 psf_residual=call.psf_residual, _fit_info=call._fit_info)
         self._tell_of_correlation()
         return table
 
     def _measure(self, pixels, init_params):
         """Do what a call does; changes this object."""
+        self._check_residual()
+        self.psf_residual = None
         pixels = self._without_saturated(pixels)
         data, error = (array if array is None
                        else with_unit(array, pixels.unit)
@@ -253,8 +273,8 @@ class MixturePSFPhotometry(PSFPhotometry):
         image = self._make_image(data, mask, error)
         result, group_size = self._fit_contexts(image, init_params)
         if not self.psf_model.contexts:
-            result, image = with_measured_wings(
-                result, image, self.psf_model,
+            result, image, self.psf_residual = without_residual(
+                result, image, self.psf_model, self.residual_radius,
                 partial(self._fit_again, init_params))
         result = with_misfit(result, error is not None
                              or self.effective_gain is not None)
@@ -270,6 +290,16 @@ class MixturePSFPhotometry(PSFPhotometry):
             '' if correlation is None else str(correlation))
         self._warn_of_failures(result)
         return self.results
+
+    def _check_residual(self):
+        """Raise an error if no residual can be measured though asked for."""
+        if self.residual_radius is None or (
+                self._can_fit and not self.psf_model.contexts):
+            return
+        msg = ('residual_radius must be None for a psf_model that '
+               'depends on colours or fluxes or is left to photutils, got '
+               f'{self.residual_radius:g}')
+        raise ValueError(msg)
 
     def _without_saturated(self, pixels):
         """Mask saturated pixels, and see what stars are behind them."""
@@ -412,6 +442,8 @@ class MixturePSFPhotometry(PSFPhotometry):
 
     def _fit_again(self, init_params, image, rows):
         """Return the FitResult of stars and their groups, and their rows."""
+        if rows is None:
+            return self._fit(image, init_params)[0], slice(None)
         groups = np.asarray(init_params['group_id'])
         some = np.flatnonzero(np.isin(groups, groups[rows]))
         return self._fit(image, init_params[some])[0], some
@@ -545,53 +577,3 @@ def _check_errors(fits, stars):
         msg = ('error must be positive and finite under the stars, got a '
                f'value that is not near x={x:.1f}, y={y:.1f}')
         raise ValueError(msg)
-
-
-def aperture_correction(psf_model, x, y, radius):
-    """
-    Return what makes aperture fluxes total, star by star.
-
-    Parameters
-    ----------
-    psf_model : GriddedMixturePSF or MultiGaussianPSFModel
-        The PSF.
-    x, y : (n,) array_like
-        Positions [pix]; the correction is NaN where they are not finite.
-    radius : float
-        The radius of the aperture [pix].
-
-    Returns
-    -------
-    (n,) `~numpy.ndarray`
-        One over the encircled energy of the PSF at each position.
-
-    Examples
-    --------
-    >>> from photutils_mgauss import GaussianMixture, MultiGaussianPSFModel
-    >>> from photutils_mgauss.photometry import aperture_correction
-    >>> mixture = GaussianMixture([1], [[0, 0]], [[[1, 0], [0, 1]]])
-    >>> aperture_correction(MultiGaussianPSFModel(mixture), [10], [10], 2)
-    array([1.15651764])
-    """
-    x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)),
-                               np.atleast_1d(np.asarray(y, float)))
-    correction = np.full(x.shape, np.nan)
-    good = np.isfinite(x) & np.isfinite(y)
-    energy = encircled_energy(psf_model, x[good], y[good], radius)
-    correction[good] = 1 / energy
-    return correction
-
-
-def encircled_energy(psf_model, x, y, radius):
-    """Return the fraction of a star's flux within a radius, (n,)."""
-    grid = psf_model.grid
-    nodes = np.array([grid.node(m).encircled_energy(radius)
-                      for m in range(len(grid.scales))])
-    if nodes.size == 1:
-        return np.full(x.shape, nodes[0])
-    out = np.empty(x.size)
-    for i in range(x.size):
-        index, share = grid.neighbours(x[i], y[i])
-        share = share * grid.scales[index]
-        out[i] = share @ nodes[index] / share.sum()
-    return out

@@ -7,13 +7,10 @@ sees pixels as far out as it takes to have wings all around.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from astropy.stats import mad_std
 from astropy.table import QTable
 
 from photutils_mgauss.photometry.table import fit_quality
 from photutils_mgauss.psf.local import LocalPSF
-from photutils_mgauss.psf.renderer import MixtureRenderer
-from photutils_mgauss.psf.residual import PSFResidual
 from photutils_mgauss.psf.wings import stars_behind
 from photutils_mgauss.utils.flags import SATURATED
 from photutils_mgauss.utils.image import read_level
@@ -23,9 +20,6 @@ from photutils_mgauss.utils.star_columns import read_sources
 # A star of a list is a saturated one if it is not this much further from it
 # than the edge of what is hidden [pix]; what a finder sees there is no star.
 _BESIDE = 2.0
-# Stars of so many standard errors tell what the PSF leaves of bright ones;
-# all are drawn down to this part of the noise.
-_BRIGHT, _FAINTEST = 50.0, 0.02
 
 
 @dataclass(frozen=True)
@@ -144,86 +138,6 @@ def flag(flags, rows):
     """Set the bit of saturated stars in their rows."""
     flags[rows[rows >= 0]] |= SATURATED
     return flags
-
-
-def with_measured_wings(result, image, model, refit):
-    """
-    Return results whose saturated stars know how wings differ from the PSF.
-
-    What the PSF leaves of bright stars is measured (`PSFResidual`), taken off
-    the saturated ones, and these are fitted again with those in their groups.
-
-    Parameters
-    ----------
-    result : FitResult
-    image : `~photutils_mgauss.kernels.Image`
-    model : GriddedMixturePSF or MultiGaussianPSFModel
-    refit : callable
-        Returns the FitResult of an image, and which rows it has.
-
-    Returns
-    -------
-    FitResult, `~photutils_mgauss.kernels.Image`
-    """
-    rows = result.saturated[result.saturated >= 0]
-    rows = rows[np.isfinite(result.values[rows]).all(axis=1)]
-    if not rows.size:
-        return result, image
-    stars = result.values[:, [1, 2, 0]].T
-    half = int(result.shapes[rows].max()) // 2
-    left, variance = _left_over(image, model, stars)
-    known = PSFResidual.of(
-        left, _without(variance, image.mask, stars[:, rows], half),
-        stars[:, _telling(result)], half)
-    if known is None:
-        return result, image
-    image = _cleaned(image, known, stars[:, rows], half)
-    return result.updated(*refit(image, rows)), image
-
-
-def _cleaned(image, known, stars, half):
-    """Return an image without what the PSF leaves of some stars."""
-    data, more = image.data.copy(), np.zeros(image.data.shape)
-    known.take_off(data, more, stars, half)
-    if not image.error.size:
-        return image._replace(data=data)
-    return image._replace(data=data, error=np.sqrt(image.error**2 + more))
-
-
-def _left_over(image, model, stars):
-    """Return an image without its stars, and the variances of its pixels."""
-    variance = (image.error**2 if image.error.size
-                else np.zeros(image.data.shape))
-    if image.gain:
-        variance = variance + np.maximum(image.data, 0) / image.gain
-    noise = np.sqrt(np.nanmedian(variance))
-    if not noise > 0:
-        # Without errors what stars do not cover tells.
-        noise = mad_std(image.data, ignore_nan=True)
-        variance = np.full(image.data.shape, noise**2)
-    return image.data - MixtureRenderer(model).image(
-        stars, _FAINTEST * noise, image.data.shape), variance
-
-
-def _without(variance, mask, saturated, half):
-    """Return variances, 0 where pixels are masked or next to saturation."""
-    out = np.where(mask if mask.size else False, 0, variance)
-    for x, y, _ in saturated.T:
-        row, column = int(np.rint(y)), int(np.rint(x))
-        out[max(row - half, 0):row + half + 1,
-            max(column - half, 0):column + half + 1] = 0
-    return out
-
-
-def _telling(result):
-    """Return the rows of bright stars that were fitted well."""
-    with np.errstate(invalid='ignore', divide='ignore'):
-        bright = result.values[:, 0] > _BRIGHT * result.errors[:, 0]
-    bright &= result.valid & result.converged & np.isfinite(
-        result.values).all(axis=1)
-    bright &= result.n_pixels == result.shapes.prod(axis=1)
-    bright[result.saturated[result.saturated >= 0]] = False
-    return np.flatnonzero(bright)
 
 
 def with_misfit(result, has_error):

@@ -12,9 +12,12 @@ changes slowly over the detector,
 
 with u and v from -1 to 1 across the detector. Its terms are sampled twice a
 pixel, as means over the stars, and shrunk ring by ring to what stands out of
-noise, so that they end where nothing is known.
+noise, so that they end where nothing is known; beyond a radius they fade.
+
+A level of the sky that stars share is told from that by stars of other
+fluxes: divided by these it is not the same for all.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -39,11 +42,15 @@ def _remaining_variance():
 _SMOOTHED = _remaining_variance()
 # Fewer stars tell nothing, fewer than the second nothing of slopes; more than
 # the last are not needed.
-_FEWEST, _FEW, _MOST = 5, 30, 300
+FEWEST, _FEW, _MOST = 5, 30, 300
 # What is not so many standard errors above noise is noise.
 _SIGNIFICANT = 4.0
 # Pixels further off than so many standard errors hold something else.
 _CLIP, _PASSES = 4.0, 3
+# The level of the sky is known to this part of a pixel's noise beforehand.
+_SKY = 0.1
+# Beyond the radius it fades, and ends at so many times that.
+_END = 1.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +67,17 @@ class PSFResidual:
         How much stars differ from that, for each full pixel of distance.
     shape : (ny, nx) tuple
         The pixels of the image.
+    sky : float
+        The level of the sky that was left around the stars.
     """
 
     terms: np.ndarray
     spread: np.ndarray
     shape: tuple
+    sky: float = 0.0
 
     @classmethod
-    def of(cls, residual, variance, stars, half):
+    def of(cls, residual, variance, stars, radius, bright=None):
         """
         Measure what is left of bright stars.
 
@@ -77,8 +87,10 @@ class PSFResidual:
             The image without its stars; no variance is a pixel of no use.
         stars : (3, n) `~numpy.ndarray`
             The places and fluxes of stars that tell.
-        half : int
+        radius : float
             How far from stars to look [pix].
+        bright : (variance, stars) tuple, optional
+            Stars that tell, too, such as saturated ones, and where.
 
         Returns
         -------
@@ -87,20 +99,26 @@ class PSFResidual:
         """
         stars = stars[:, np.argsort(-stars[2], kind='stable')[:_MOST]]
         n = stars.shape[1]
-        if n < _FEWEST:
+        if n < FEWEST:
             return None
-        samples = _Samples.of(residual, variance, stars, half,
+        seen = [(variance, *star) for star in stars.T]
+        if bright is not None:
+            seen += [(bright[0], *star) for star in bright[1].T]
+        samples = _Samples.of(residual, seen, whole_reach(radius),
                               3 if n >= _FEW else 1)
         spread = np.zeros(samples.n_rings)
         good = np.ones(samples.value.size, bool)
         for _ in range(_PASSES):
             more = spread[samples.ring]**2
-            terms, unknown = samples.terms(
-                good / (samples.mean_variance + more))
-            left = samples.value - samples.read(terms)
-            good = np.abs(left) < _CLIP * np.sqrt(samples.variance + more)
-            spread = samples.spread(left, good)
-        return cls(terms, np.sqrt(spread**2 + unknown), residual.shape)
+            weight = good / (samples.mean_variance + more)
+            sky = samples.sky(weight)
+            here = samples.without(sky)
+            terms, unknown = here.terms(weight)
+            left = here.value - here.read(terms)
+            good = np.abs(left) < _CLIP * np.sqrt(here.variance + more)
+            spread = here.spread(left, good)
+        return cls(_faded(terms, radius), np.sqrt(spread**2 + unknown),
+                   residual.shape, sky)
 
     def stamp(self, x, y, half):
         """
@@ -116,6 +134,30 @@ class PSFResidual:
         ring = _ring(dx[None], dy[:, None])
         return map_coordinates(term, at, order=1), self.spread[
             np.minimum(ring, self.spread.size - 1)]
+
+    def image(self, x, y, flux):
+        """
+        Return an image of what the PSF leaves of stars.
+
+        Parameters
+        ----------
+        x, y, flux : (n,) array_like
+            The stars [pix].
+
+        Returns
+        -------
+        (ny, nx) `~numpy.ndarray`
+        """
+        out = np.zeros(self.shape)
+        stars = np.array([x, y, flux], float).reshape(3, -1)
+        self.take_off(out, np.zeros(self.shape),
+                      stars[:, np.isfinite(stars).all(axis=0)], self.reach)
+        return -out
+
+    @property
+    def reach(self):
+        """How many pixels from a star it ends."""
+        return len(self.terms[0]) // (2 * _FINE) - 1
 
     def take_off(self, data, variance, stars, half):
         """
@@ -135,6 +177,8 @@ class _Samples:
     """
     Pixels around stars: residuals over the flux, and their variances (m,).
 
+    ``level`` is what a unit of the sky would be, one over the flux.
+
     ``mean_variance`` is that of a star's pixels at a distance: weights by a
     variance that was made from the pixel itself would favour low ones.
     ``x`` and ``y`` are where they are in the image of samples, ``slopes``
@@ -145,6 +189,7 @@ class _Samples:
     value: np.ndarray
     variance: np.ndarray
     mean_variance: np.ndarray
+    level: np.ndarray
     x: np.ndarray
     y: np.ndarray
     ring: np.ndarray
@@ -152,22 +197,37 @@ class _Samples:
     half: int
 
     @classmethod
-    def of(cls, residual, variance, stars, half, n_terms):
+    def of(cls, residual, stars, half, n_terms):
         columns = []
-        for x, y, flux in stars.T:
+        for variance, x, y, flux in stars:
             part, _ = _overlap(x, y, half, residual.shape)
             j, i = np.nonzero(variance[part] > 0)
             dx, dy = i + part[1].start - x, j + part[0].start - y
             noise, ring = variance[part][j, i] / flux**2, _ring(dx, dy)
             mean = np.bincount(ring, noise) / np.maximum(np.bincount(ring), 1)
             columns.append(np.stack([
-                residual[part][j, i] / flux, noise, mean[ring], dx, dy,
-                np.full(j.size, x), np.full(j.size, y)]))
+                residual[part][j, i] / flux, noise, mean[ring],
+                np.full(j.size, 1 / flux), dx, dy, np.full(j.size, x),
+                np.full(j.size, y)]))
         *columns, dx, dy, x, y = np.concatenate(columns, axis=1)
         middle = _FINE * (half + 1)
         return cls(*columns, middle + _FINE * dx, middle + _FINE * dy,
                    _ring(dx, dy), _slopes(x, y, residual.shape)[:n_terms],
                    half)
+
+    def without(self, sky):
+        """Return the same samples without a level of the sky."""
+        return replace(self, value=self.value - sky * self.level)
+
+    def sky(self, weight):
+        """Return the level of the sky that the stars have in common."""
+        # Of what a level would look like what terms could be does not count.
+        own = self.level - self.read(
+            self._fitted(weight, self.level, self._inverse(weight)))
+        # Stars of one flux tell nothing of it.
+        noise = np.median(np.sqrt(self.variance) / self.level)
+        total = (weight * own * self.level).sum() + (_SKY * noise)**-2
+        return (weight * own * self.value).sum() / total
 
     @property
     def n_rings(self):
@@ -193,15 +253,19 @@ class _Samples:
         And the variances that they have left at each distance.
         """
         inverse = self._inverse(weight)
-        terms = self._means(weight * self.value, inverse)
-        for _ in range(_SHARPER):
-            left = self.value - self.read(terms)
-            terms += self._means(weight * left, inverse)
+        terms = self._fitted(weight, self.value, inverse)
         noise = _SMOOTHED * np.einsum('jikk->kji', inverse)
         shrunk, unknown = zip(*(_shrunk(*one) for one in zip(
             terms, noise, strict=True)), strict=True)
         # The mean square of a slope's factor is a third.
         return np.array(shrunk), unknown[0] + sum(unknown[1:]) / 3
+
+    def _fitted(self, weight, value, inverse):
+        """Return the terms (k, w, w) of what pixels (m,) have."""
+        terms = self._means(weight * value, inverse)
+        for _ in range(_SHARPER):
+            terms += self._means(weight * (value - self.read(terms)), inverse)
+        return terms
 
     def _inverse(self, weight):
         """Return the covariances (w, w, k, k) of terms, 0 for none."""
@@ -246,6 +310,18 @@ def _shrunk(term, noise):
     share = np.divide(total - noise, total, where=total > least,
                       out=np.zeros(total.size))
     return term * share[ring], share * noise / count
+
+
+def whole_reach(radius):
+    """Return how many pixels from a star what is left of it ends."""
+    return int(np.ceil(_END * radius))
+
+
+def _faded(terms, radius):
+    """Return terms that fade beyond a radius [pix]."""
+    y, x = (np.indices(terms.shape[1:]) - terms.shape[1] // 2) / _FINE
+    beyond = (np.hypot(x, y) / radius - 1) / (_END - 1)
+    return terms * np.cos(np.pi / 2 * np.clip(beyond, 0, 1))**2
 
 
 def _slopes(x, y, shape):

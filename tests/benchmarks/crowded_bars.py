@@ -56,14 +56,16 @@ class Bars:
 def even(bars, args, optics):
     """Measure two exposures of a bulge field."""
     for rows in scenes.even_part(args, optics):
-        low, _, ratio, _, _, bias, place, flux = rows[rows[:, 0] < 24].T
+        low, n, ratio, _, _, bias, place, flux = rows[rows[:, 0] < 24].T
         at = np.isin(low, (17, 18, 20, 22))
         bars.add('RMS/CRLB, true PSF, 17-18 18-19 20-21 22-23', 1.4,
                  ratio[at])
         bars.add('pulls of x and y, 17 to 24 mag', 1.1,
                  [place.min(), place.max()], low=0.9)
-        bars.add('pulls of flux, 17-19 mag (few stars)', 1.1, flux[:2],
-                 low=0.9)
+        # The width that a median tells of n normal errors is off by chance.
+        chance = 1.17 / np.sqrt(n[:2].min())
+        bars.add(f'pulls of flux, 17-19 mag (by chance +- {chance:.2f})',
+                 1.1, flux[:2], low=0.9)
         bars.add('pulls of flux, 19 to 24 mag', 1.1,
                  [flux[2:].min(), flux[2:].max()], low=0.9)
         bars.add('bias of flux to 24 mag', 0.005, np.abs(bias).max(), '.4f')

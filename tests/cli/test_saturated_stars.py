@@ -48,3 +48,25 @@ def test_a_saturated_star_is_measured_and_said(folder, capsys, image,
     star = table[near][np.argmax(table['flux_fit'][near])]
     assert np.hypot(star['x_fit'] - X, star['y_fit'] - Y) < 0.05
     assert star['flags'] & 65536
+
+
+@pytest.mark.parametrize('how', [[], ['--crowded']])
+def test_few_stars_leave_no_residual_to_measure(folder, capsys, how):
+    output = folder / f'few_{len(how)}.ecsv'
+    main(['photometry', str(folder / 'header.fits'), '--psf',
+          str(folder / 'psf.fits'), '--output', str(output),
+          '--residual-radius', '10', *how])
+    said = capsys.readouterr()
+    assert 'what the PSF leaves of bright stars was not measured' in (
+        said.out + said.err)
+    assert output.exists()
+
+
+def test_images_together_have_no_residual(folder, capsys):
+    code = main(['photometry', str(folder / 'header.fits'), '--psf',
+                 str(folder / 'psf.fits'), '--crowded', '--together',
+                 '--residual-radius', '10', '--output',
+                 str(folder / 'together.ecsv')])
+    assert code == 1
+    assert 'must be given without --residual-radius' in (
+        capsys.readouterr().err)

@@ -73,3 +73,25 @@ def test_other_light_in_some_pixels_does_no_harm():
         200.0, 200.0, HALF)[0]
     assert np.sqrt(np.mean((spoiled - clean)**2)) < (
         0.1 * np.abs(clean).max())
+
+
+@pytest.mark.parametrize('same', [False, True])
+def test_a_level_of_the_sky_is_not_taken_for_wings(same):
+    image, variance, stars = scene(250, 1, amplitude=0)
+    rng = np.random.default_rng(7)
+    # Of stars of one flux it cannot be told, and nothing is made up.
+    stars[2] = 1e5 if same else 10**rng.uniform(4, 5.5, 250)
+    level = 0.0 if same else 2.0
+    found = PSFResidual.of(image + level, variance, stars, HALF)
+    assert found.sky == pytest.approx(level, abs=0.05)
+    assert np.abs(found.stamp(200.0, 200.0, HALF)[0]).mean() < 2e-6
+
+
+def test_it_fades_beyond_the_radius():
+    found = PSFResidual.of(*scene(250, 1), HALF)
+    seen = found.image([200.2], [200.4], [1e5])
+    y, x = np.indices(seen.shape)
+    away = np.hypot(x - 200.2, y - 200.4)
+    assert not seen[away > 1.3 * HALF].any()
+    inside = found.stamp(200.2, 200.4, HALF)[0]
+    np.testing.assert_allclose(seen[191:210, 191:210], 1e5 * inside)
