@@ -60,8 +60,8 @@ def fit_images(images, listed, settings, *, motions):
         # What is known of fluxes and places is said once for all images.
         [replace(one, count_slope=0.0) for one in each],
         replace(each[0], gain=None), field.grid,
-        np.ones(len(each)), _factors(field, motions), settings.tile_shape,
-        settings.overlap, given,
+        np.ones(len(each)), _factors(field, motions), _bands(field, motions),
+        settings.tile_shape, settings.overlap, given,
         settings.checkpoint).with_scales()
     outcomes, errors = run(plan, settings.executor, settings.progress_bar)
     left = [core for core, outcome in zip(plan.cores, outcomes, strict=True)
@@ -75,6 +75,14 @@ def _factors(field, motions):
     if motions:
         factors[:, :, 2:] *= field.time_since_mean()[:, None, None]
     return factors
+
+
+def _bands(field, motions):
+    """Return the number (E,) of what may have fluxes in common."""
+    # Without motions images are there for their fluxes.
+    if not motions:
+        return np.arange(len(field.pixels))
+    return np.unique(field.bands, return_inverse=True)[1]
 
 
 def _psfs(settings, field):
