@@ -34,6 +34,8 @@ _LARGEST_FALL = 0.8
 FARTHEST = 3.0
 # An inverse variance with which places stay where they are [1 / pix^2].
 _HELD = 1e30
+# What is left of residuals that are but noise: fluxes are as sure as that.
+_ENOUGH = 1e-3
 # Stars whose covariances are made at a time.
 _AT_ONCE = 4096
 
@@ -92,7 +94,8 @@ class ManyEquations:
                              np.ones((n_images, n), bool), n_images * n)
         free = replace(self, ties=alone, drift=np.zeros(self.drift.shape),
                        hold=np.full(self.hold.shape, _HELD))
-        return free.solve(0.0)[0]
+        system = _System.of(free, 0.0)
+        return system.parts(system.solve(_ENOUGH))[0]
 
     def flux_errors(self, *, alone=False):
         """
@@ -253,14 +256,14 @@ class _System:
                                  self.stars[k], self.pairs, self.meshes[k],
                                  scratch, out)
 
-    def solve(self):
+    def solve(self, tolerance=TOLERANCE):
         """Return the solution by preconditioned conjugate gradients."""
         r = self.right.copy()
         step, z, a = np.zeros((3, r.size))
         largest = max(mesh.gradient.size for mesh in self.meshes)
         scratch = np.empty((2, 3 * len(self.hold) + largest))
         rz = kernels.precondition_shared(self.blocks, r, z)
-        v, goal = z.copy(), TOLERANCE**2 * rz
+        v, goal = z.copy(), tolerance**2 * rz
         for _ in range(CG_STEPS):
             if not rz > goal:
                 break

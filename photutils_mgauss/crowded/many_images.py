@@ -56,7 +56,7 @@ def fit_images(images, listed, settings, *, motions):
                       bound=settings.bound)
     each = [settings.options_of(one) for one in field.pixels]
     plan = ManyPlan(
-        field.pixels, _psfs(settings, field),
+        field.pixels, list(_psfs(settings, field)),
         # What is known of fluxes and places is said once for all images.
         [replace(one, count_slope=0.0) for one in each],
         replace(each[0], gain=None), field.grid,
@@ -86,8 +86,15 @@ def _bands(field, motions):
 
 
 def _psfs(settings, field):
-    return [LocalPSF.of(settings.model_of(pixels) if psf is None else psf)
-            for psf, pixels in zip(field.psfs, field.pixels, strict=True)]
+    """Return the PSF of each image, made once where images have the same."""
+    made = {}
+    for psf, pixels in zip(field.psfs, field.pixels, strict=True):
+        if psf is None:
+            yield LocalPSF.of(settings.model_of(pixels))
+        else:
+            if id(psf) not in made:
+                made[id(psf)] = LocalPSF.of(psf)
+            yield made[id(psf)]
 
 
 def _table(plan, outcomes, field):
