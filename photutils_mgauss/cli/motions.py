@@ -24,6 +24,9 @@ _TABLE_SUFFIXES = ('.ecsv', '.csv', '.txt', '.dat', '.vot', '.xml', '.votable')
 _FEW = 5
 _TOO_MUCH = 2.0
 
+# Errors of frames of more numbers make no table.
+_MOST_NUMBERS = 1_000_000
+
 # Running numbers of one image are no names of stars.
 _NUMBERS = ('id', 'group_id')
 
@@ -212,6 +215,7 @@ class _Names:
             return tools.output_names([piece.name for piece in pieces],
                                       str(folder), ending, (), suffix)
         tables = ['motions', 'alignment', 'residuals']
+        tables += [] if options.plane else ['frame_errors']
         tables += ['terms'] if options.terms else []
         self.tables = {name: folder / f'{name}.{options.format}'
                        for name in tables}
@@ -445,6 +449,8 @@ def _collect(solution, names, exposures, record, results):
     key = results.key(_content(solution))
     for name, path in names.tables.items():
         table = _TABLES[name](solution)
+        if table is None:
+            continue
         write = partial(tools.write_table, table, record=record)
         results.obtain(path, f'{key}_{name}', partial(_made, table, write))
     for epoch, own in zip(solution.epochs, exposures, strict=True):
@@ -475,7 +481,23 @@ def _residuals(solution):
     return hstack([solution.residuals, solution.detector_residuals()])
 
 
+def _frame_errors(solution):
+    """Return what --pixels --frames has to know of the frames."""
+    from astropy.utils.exceptions import AstropyUserWarning
+
+    from photutils_mgauss.motions.frame_errors import FrameErrors
+    errors = FrameErrors.of(solution)
+    if errors.factor.size > _MOST_NUMBERS:
+        warnings.warn(
+            f'frame_errors is not written: {errors.factor.size} numbers are '
+            'too many for a table; --pixels --frames takes these frames as '
+            'exact', AstropyUserWarning, stacklevel=2)
+        return None
+    return errors.to_table()
+
+
 _TABLES = {'motions': _stars, 'residuals': _residuals,
+           'frame_errors': _frame_errors,
            'alignment': attrgetter('alignment'), 'terms': attrgetter('terms')}
 
 

@@ -9,6 +9,9 @@ from photutils_mgauss.cli.results import Results, file_marks
 
 _TABLES = ('motions', 'light_curves', 'images', 'cutouts')
 
+_EXACT = ('the frames count as exact: there are no frame_errors of the WCS in '
+          '--frames, and errors of stars are without theirs')
+
 # Stars of both tables that are nearer than this are one.
 _SAME = 0.1 / 3600
 
@@ -25,7 +28,8 @@ def add_options(parser):
     group.add_argument('--frames', metavar='FOLDER',
                        help='with --pixels: what mgauss motions wrote of '
                             'these exposures before, for the corrected WCS '
-                            '(default: the WCS of the images)')
+                            'and what their errors add to those of stars '
+                            '(default: the WCS of the images, without error)')
     group.add_argument('--targets', metavar='TABLE',
                        help='with --pixels: ra and dec of the stars '
                             '(default: those found in all images together)')
@@ -65,11 +69,14 @@ def run(options):
             marks.append([file_marks(path, owners[i], frame),
                           image.content])
             tools.say(options, f'{path}: {epochs[i]!r}')
+        if options.frames and _frame_errors_file(options) is None:
+            tools.say(options, _EXACT)
         if results.only_planned():
             return
         step('find and fit stars')
         solve = cache(partial(_solve, options, epochs))
-        key = results.key(marks, file_marks(options.targets))
+        key = results.key(marks, file_marks(
+            options.targets, _frame_errors_file(options)))
         tables = [results.obtain(path, f'{key}_{name}', partial(
             _made, options, solve, name), _read_table)
             for name, path in names.items()]
@@ -157,9 +164,30 @@ def _solve(options, epochs):
         stars, _ = read_table(options.targets)
     fitter = PixelMotionFitter(parallax=options.parallax,
                                forced=options.forced,
+                               references=_frame_errors(options),
                                refine_frames=options.refine_frames,
                                fit_shape=options.fit_shape)
     return fitter.fit(epochs, stars)
+
+
+def _frame_errors(options):
+    """Return the errors of the frames given, or None."""
+    from photutils_mgauss.motions.frame_errors import FrameErrors
+    file = _frame_errors_file(options)
+    if file is None:
+        return None
+    with tools.about(file):
+        return FrameErrors.from_table(_read_table(file))
+
+
+def _frame_errors_file(options):
+    """Return the file of the errors of the frames given, or None."""
+    # A WCS that is given is not that of the frames.
+    if options.frames is None or options.wcs:
+        return None
+    found = [Path(options.frames) / f'frame_errors{suffix}'
+             for suffix in ('.ecsv', '.fits')]
+    return next(filter(Path.is_file, found), None)
 
 
 def _made(options, solve, name):

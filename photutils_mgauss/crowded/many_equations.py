@@ -3,13 +3,16 @@ The joint normal equations of the stars and skies of many images.
 
 The unknowns are the fluxes and skies of each image and what all have in
 common, the place of each star and, if stars move, its motion: p numbers q,
-which image k sees at :math:`F_k q`. In the equations of one image
+which image k sees at :math:`F_k q`. Stars whose motions are fitted have one
+flux for all images of a band, times the scale of each: with noisy fluxes of
+their own, blends would seem to move. In the equations of one image
 (`Equations`), whose derivatives are by the common coordinates, only the
 blocks of places are shared: for all images these add up. They are solved by
 conjugate gradients; each star's own
 block, with as many fluxes as there are images, is the preconditioner.
 """
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -29,6 +32,10 @@ _LARGEST_FALL = 0.8
 # Before anything is known a star is taken to move by so much, in the image
 # that sees it move the farthest [pix]: no matter for stars that are seen.
 FARTHEST = 3.0
+# An inverse variance with which places stay where they are [1 / pix^2].
+_HELD = 1e30
+# What is left of residuals that are but noise: fluxes are as sure as that.
+_ENOUGH = 1e-3
 # Stars whose covariances are made at a time.
 _AT_ONCE = 4096
 
@@ -41,7 +48,7 @@ class ManyEquations:
     ``each`` are those of single images; ``pull`` (E, n) is what is known of
     fluxes before, ``hold`` (n, p) the inverse variances with which places and
     motions are held to where they were, ``drift`` (n, p) away; ``scales`` (E,
-    1), ``factors`` (E, 2, p).
+    1), ``factors`` (E, 2, p), ``ties`` which fluxes are one.
     """
 
     each: list
@@ -51,6 +58,7 @@ class ManyEquations:
     drift: np.ndarray
     pull: np.ndarray
     scales: np.ndarray
+    ties: kernels.Ties
 
     @classmethod
     def of(cls, tile):
@@ -61,7 +69,7 @@ class ManyEquations:
         hold[:, :2] = stars.hold[:, None]
         hold[:, 2:] = (reach_of(factors)[2:] / FARTHEST)**2
         bare = cls(each, tile.neighbours, factors, hold, np.column_stack(
-            [stars.drift.T, stars.rate]), None, tile.scales)
+            [stars.drift.T, stars.rate]), None, tile.scales, tile.ties())
         return replace(bare, pull=bare._expect(
             tile.fluxes, tile.options.count_slope, stars.hold > 0))
 
@@ -70,9 +78,34 @@ class ManyEquations:
         return np.array([np.maximum(one.stars.matrix[:, 0, 0], 0)
                          for one in self.each])
 
-    def flux_errors(self):
-        """Return standard errors (E, n) of fluxes, nothing else free."""
-        own = self._own()
+    def residual_fluxes(self):
+        """Return what residuals say of fluxes (E, n), nothing else free."""
+        light = gathered(self.ties, np.array(
+            [one.stars.gradient[:, 0] for one in self.each]))
+        own = gathered(self.ties, self.ties.scale * self._own())
+        return self.ties.scale * np.divide(
+            light, own, where=own > 0, out=np.zeros(own.shape))[self.ties.slot]
+
+    def each_flux(self):
+        """Return steps of fluxes (E, n), each free, at places that stay."""
+        n_images, n = self.pull.shape
+        alone = kernels.Ties(np.arange(n_images * n).reshape(n_images, n),
+                             np.ones((n_images, n)),
+                             np.ones((n_images, n), bool), n_images * n)
+        free = replace(self, ties=alone, drift=np.zeros(self.drift.shape),
+                       hold=np.full(self.hold.shape, _HELD))
+        system = _System.of(free, 0.0)
+        return system.parts(system.solve(_ENOUGH))[0]
+
+    def flux_errors(self, *, alone=False):
+        """
+        Return standard errors (E, n) of fluxes, nothing else free.
+
+        ``alone`` asks what each image tells of its own flux.
+        """
+        scale, own = self.ties.scale, self._own()
+        if not alone:
+            own = gathered(self.ties, scale * own)[self.ties.slot] / scale**2
         return np.divide(1, np.sqrt(own), where=own > 0,
                          out=np.zeros(own.shape))
 
@@ -142,6 +175,12 @@ class ManyEquations:
                     together, variance[k, part], correlation[k, part])
         return place, variance, correlation
 
+    @cached_property
+    def _every(self):
+        """The equations of stars, those of all images in one array each."""
+        return kernels.StarEquations(*map(np.array, zip(*(
+            one.stars for one in self.each), strict=True)))
+
     def _together(self, part):
         """Return stars with neighbours, and what is known of their places."""
         n, m = part.stop - part.start, kernels.MOST_TOGETHER
@@ -149,9 +188,8 @@ class ManyEquations:
         together = kernels.Together(
             np.zeros((n, m), np.int64), np.zeros(n, np.int64),
             np.zeros((n, p * m, p * m)))
-        for one, factors in zip(self.each, self.factors, strict=True):
-            kernels.add_places(part.start, one.stars, self.neighbours.pairs,
-                               factors, together)
+        kernels.add_places(part.start, self._every, self.neighbours.pairs,
+                           self.factors, self.ties, together)
         at = np.arange(p * m)
         together.free[:, at, at] += self.hold[together.members].reshape(
             n, p * m)
@@ -168,6 +206,7 @@ class _System:
     pairs: object
     factors: np.ndarray
     hold: np.ndarray
+    ties: kernels.Ties
     right: np.ndarray
     blocks: kernels.Blocks
 
@@ -180,49 +219,51 @@ class _System:
         meshes = [one.mesh._replace(
             diagonal=one.mesh.diagonal * (1 + one.level_damping))
             for one in each]
-        hold, factors = equations.hold, equations.factors
+        hold, factors, ties = (equations.hold, equations.factors,
+                               equations.ties)
+        light = np.array([one.stars.gradient[:, 0] for one in each])
         place = sum(one.stars.gradient[:, 1:] @ factor for one, factor in zip(
             each, factors, strict=True))
-        right = [*(one.stars.gradient[:, 0] - pull for one, pull in zip(
-            each, equations.pull, strict=True)),
-            (place - hold * equations.drift).ravel(),
-            *(one.mesh.gradient for one in each)]
+        right = [gathered(ties, light - equations.pull),
+                 (place - hold * equations.drift).ravel(),
+                 *(one.mesh.gradient for one in each)]
         return cls(stars, meshes, equations.neighbours.pairs, factors, hold,
-                   np.concatenate(right), _blocks(stars, meshes, factors,
-                                                  hold))
+                   ties, np.concatenate(right), _blocks(
+                       stars, meshes, factors, hold, ties))
 
     @property
     def _ends(self):
         """Where places end and the levels of each image."""
-        (n, p), n_images = self.hold.shape, len(self.stars)
         sizes = [mesh.gradient.size for mesh in self.meshes]
-        return np.cumsum([(n_images + p) * n, *sizes])
+        return np.cumsum([self.ties.size + self.hold.size, *sizes])
+
+    def _places(self, v):
+        """Return the part (n, p) of a vector that is places."""
+        size = self.ties.size
+        return v[size:size + self.hold.size].reshape(self.hold.shape)
 
     def parts(self, v):
-        """Return the parts of a vector: fluxes, places, levels."""
-        (n, p), n_images, ends = (self.hold.shape, len(self.stars),
-                                  self._ends)
-        return (v[:n * n_images].reshape(n_images, n),
-                v[n * n_images:ends[0]].reshape(n, p),
-                [v[a:b] for a, b in pairwise(ends)])
+        """Return the parts of a vector: fluxes (E, n), places, levels."""
+        return (self.ties.scale * v[self.ties.slot], self._places(v),
+                [v[a:b] for a, b in pairwise(self._ends)])
 
     def _apply(self, v, scratch, out):
         """Put the product with a vector into out."""
         out[:] = 0
-        _, place, _ = self.parts(v)
-        self.parts(out)[1][:] = self.hold * place
+        self._places(out)[:] = self.hold * self._places(v)
         for k, first in enumerate(self._ends[:-1]):
-            kernels.apply_shared(k, self.factors, first, v, self.stars[k],
-                                 self.pairs, self.meshes[k], scratch, out)
+            kernels.apply_shared(k, self.factors, self.ties, first, v,
+                                 self.stars[k], self.pairs, self.meshes[k],
+                                 scratch, out)
 
-    def solve(self):
+    def solve(self, tolerance=TOLERANCE):
         """Return the solution by preconditioned conjugate gradients."""
         r = self.right.copy()
         step, z, a = np.zeros((3, r.size))
         largest = max(mesh.gradient.size for mesh in self.meshes)
         scratch = np.empty((2, 3 * len(self.hold) + largest))
         rz = kernels.precondition_shared(self.blocks, r, z)
-        v, goal = z.copy(), TOLERANCE**2 * rz
+        v, goal = z.copy(), tolerance**2 * rz
         for _ in range(CG_STEPS):
             if not rz > goal:
                 break
@@ -240,20 +281,31 @@ def reach_of(factors):
     return np.maximum(np.abs(factors).max(axis=(0, 1)), 1e-300)
 
 
-def _blocks(stars, meshes, factors, hold):
+def gathered(ties, values):
+    """Return the sums (size,) of values (E, n) of what is one flux."""
+    return np.bincount(ties.slot.ravel(), (ties.scale * values).ravel(),
+                       minlength=ties.size)
+
+
+def _blocks(stars, meshes, factors, hold, ties):
     """Return what the inverse of each star's own block is made of."""
-    diagonal = np.array([one.matrix[:, 0, 0] for one in stars])
+    diagonal = gathered(ties, ties.scale * np.array(
+        [one.matrix[:, 0, 0] for one in stars]))
     own = np.divide(1, diagonal, where=diagonal > 0,
-                    out=np.zeros(diagonal.shape))
+                    out=np.zeros(diagonal.shape))[ties.slot]
     n, p = hold.shape
-    share, left = np.empty((len(stars), n, p)), np.zeros((n, p, p))
+    cross = np.array([one.matrix[:, 0, 1:] @ factor for one, factor in zip(
+        stars, factors, strict=True)])
+    share = np.stack([gathered(ties, cross[:, :, q])[ties.slot]
+                      for q in range(p)], axis=-1)
+    left = np.zeros((n, p, p))
     left[:, np.arange(p), np.arange(p)] = hold
     for k, (one, factor) in enumerate(zip(stars, factors, strict=True)):
-        cross = share[k] = one.matrix[:, 0, 1:] @ factor
         left += factor.T @ one.matrix[:, 1:, 1:] @ factor - (
-            own[k][:, None, None] * cross[:, :, None] * cross[:, None, :])
-    return kernels.Blocks(own, share, _inverses(left), 1 / np.concatenate(
-        [mesh.diagonal for mesh in meshes]))
+            (ties.first[k] * own[k])[:, None, None]
+            * share[k][:, :, None] * share[k][:, None, :])
+    return kernels.Blocks(ties, own, share, _inverses(left), 1 /
+                          np.concatenate([mesh.diagonal for mesh in meshes]))
 
 
 def _inverses(matrices):

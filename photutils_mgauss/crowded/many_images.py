@@ -56,12 +56,12 @@ def fit_images(images, listed, settings, *, motions):
                       bound=settings.bound)
     each = [settings.options_of(one) for one in field.pixels]
     plan = ManyPlan(
-        field.pixels, _psfs(settings, field),
+        field.pixels, list(_psfs(settings, field)),
         # What is known of fluxes and places is said once for all images.
         [replace(one, count_slope=0.0) for one in each],
         replace(each[0], gain=None), field.grid,
-        np.ones(len(each)), _factors(field, motions), settings.tile_shape,
-        settings.overlap, given,
+        np.ones(len(each)), _factors(field, motions), _bands(field, motions),
+        settings.tile_shape, settings.overlap, given,
         settings.checkpoint).with_scales()
     outcomes, errors = run(plan, settings.executor, settings.progress_bar)
     left = [core for core, outcome in zip(plan.cores, outcomes, strict=True)
@@ -77,9 +77,24 @@ def _factors(field, motions):
     return factors
 
 
+def _bands(field, motions):
+    """Return the number (E,) of what may have fluxes in common."""
+    # Without motions images are there for their fluxes.
+    if not motions:
+        return np.arange(len(field.pixels))
+    return np.unique(field.bands, return_inverse=True)[1]
+
+
 def _psfs(settings, field):
-    return [LocalPSF.of(settings.model_of(pixels) if psf is None else psf)
-            for psf, pixels in zip(field.psfs, field.pixels, strict=True)]
+    """Return the PSF of each image, made once where images have the same."""
+    made = {}
+    for psf, pixels in zip(field.psfs, field.pixels, strict=True):
+        if psf is None:
+            yield LocalPSF.of(settings.model_of(pixels))
+        else:
+            if id(psf) not in made:
+                made[id(psf)] = LocalPSF.of(psf)
+            yield made[id(psf)]
 
 
 def _table(plan, outcomes, field):

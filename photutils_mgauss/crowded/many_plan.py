@@ -46,7 +46,7 @@ class ManyPlan(Tiles):
     ``images`` are `PixelData`, ``psfs`` their `LocalPSF`, ``each`` the
     `TileOptions` of single images and ``options`` those of all; ``grid`` has
     the ``shape`` of the field and the maps ``to_image`` and ``to_grid``,
-    ``factors`` are those of a `ManyJob`.
+    ``factors`` and ``bands`` are those of a `ManyJob`.
     """
 
     solve = staticmethod(outcome_of)
@@ -58,6 +58,7 @@ class ManyPlan(Tiles):
     grid: object
     scales: np.ndarray
     factors: np.ndarray
+    bands: np.ndarray
     tile_shape: tuple | None
     overlap: int
     given: Stars | None = None
@@ -88,7 +89,8 @@ class ManyPlan(Tiles):
                         (u_low, v_low), parts[k].origin[::-1])
                 for k in there]
         return ManyJob([parts[k] for k in there], maps, there,
-                       self.scales[there], self.factors[there], self.options,
+                       self.scales[there], self.factors[there],
+                       self.bands[there], self.options,
                        (v_high - v_low, u_high - u_low), (v_low, u_low),
                        core, len(self.images), given_in(self.given, seen))
 

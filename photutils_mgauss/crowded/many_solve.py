@@ -38,6 +38,7 @@ def solve_many(job):
         if job.given is not None:
             associate(tile, job.given, leave_out)
     settle(tile, leave_out)
+    tile.measure()
     return tile
 
 

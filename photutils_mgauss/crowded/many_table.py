@@ -58,7 +58,7 @@ def tabulate(tile):
     hidden = _hidden(tile, variance)
     factor = np.array([misfit(one) for one in quality])
     count, chi2 = (np.array([one[:, i] for one in quality]) for i in (0, 1))
-    informed = np.nan_to_num(tile.fluxes**2 / variance)
+    informed = np.nan_to_num(tile.measured**2 / variance)
     place = place * _mean(factor * (1 + np.array(
         [one.position for one in hidden])**2), informed)[:, None, None]
     variance = np.where(count > 0, variance * factor, np.nan)
@@ -121,7 +121,7 @@ def _each(tile, quality, variance, hidden):
         added = error * unseen.flux
         for name, values in (
                 ('x_image', stars.x + column), ('y_image', stars.y + row),
-                ('fluxes', stars.flux - unseen.light),
+                ('fluxes', tile.measured[k] - unseen.light),
                 ('flux_err', np.hypot(error, added)),
                 ('flux_confusion_err', added),
                 ('flux_confusion', unseen.light),
@@ -141,7 +141,7 @@ def _flags(tile, quality, place, strength, correlation):
     lost = np.array([one[:, 5] < 0.5 for one in quality])
     strange = np.array([
         unlike_a_star(np.maximum(flux, 0), one) for flux, one in zip(
-            tile.fluxes, quality, strict=True)])
+            tile.measured, quality, strict=True)])
     for bit, where in (
             (NO_FLUX, ~(s.flux > 0)),
             (NO_CONVERGENCE, tile.moved > STILL),

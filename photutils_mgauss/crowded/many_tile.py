@@ -8,6 +8,7 @@ rows of a grid on the sky; the fluxes are those of the images.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from photutils_mgauss import kernels
 from photutils_mgauss.crowded.many_equations import (
@@ -25,6 +26,10 @@ _TEMPLATE_HALF = 3
 _OUTSIDE = 3.0
 # Fluxes may always change by so many standard errors: they may be negative.
 _FREE = 3.0
+# A star of this signal-to-noise ratio in one image has a flux of its own in
+# each: scales are not better known. So has one whose fluxes would be as
+# different by a smaller chance than this.
+_SURE, _CONSTANT = 100.0, 1e-5
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,8 @@ class ManyJob:
 
     ``parts`` are the `TileJob` of those images, ``images`` their numbers and
     ``scales`` their relative throughput, ``factors`` (E, 2, p) how they see
-    what places are made of: column and row, and what moves stars. ``shape``
+    what places are made of: column and row, and what moves stars. Images of
+    the same number in ``bands`` (E,) may have fluxes in common. ``shape``
     and ``origin`` (rows first) are those of the piece on the grid, ``core``
     (v_low, v_high, u_low, u_high) what of it is reported; ``n_images`` is the
     number of all images, ``given`` are the stars of a list, in columns and
@@ -82,6 +88,7 @@ class ManyJob:
     images: np.ndarray
     scales: np.ndarray
     factors: np.ndarray
+    bands: np.ndarray
     options: TileOptions
     shape: tuple
     origin: tuple
@@ -121,11 +128,14 @@ class ManyTile:
     models : list of SharedModel
     stars : Stars
         In columns and rows of the grid; fluxes are those of an image of scale
-        one, made of all images. One more column, ``rate`` (n, p - 2), is what
-        moves them.
+        one, made of all images. More columns: ``rate`` (n, p - 2) is what
+        moves them, ``constant`` whether images of a band may have one flux,
+        ``tied`` whether they have.
     equations : ManyEquations
     points : list of kernels.Points
     phases : list of kernels.Phases
+    measured : (E, n) `~numpy.ndarray`
+        Fluxes of all images, each free.
     rejected, repeats, widths, moved
         As of `Tile`; ``widths`` are those of each image.
     """
@@ -158,10 +168,25 @@ class ManyTile:
         return min(model.psf.area * size**2 for model, size in zip(
             self.models, self.pixels, strict=True))
 
+    def ties(self):
+        """Return the `~kernels.Ties` of fluxes."""
+        tied, bands = self.stars.tied, self.job.bands
+        each = np.arange(bands.size)[:, None]
+        leader = np.where(tied, np.argmax(bands == bands[:, None],
+                                          axis=1)[:, None], each)
+        first = leader == each
+        number = np.cumsum(first).reshape(first.shape) - 1
+        return kernels.Ties(
+            number[leader, np.arange(tied.size)],
+            np.where(tied, self.scales, 1.0), first, int(first.sum()))
+
     def _at_rest(self, stars):
-        """Return stars with a column for what moves them."""
-        return stars.replaced(rate=np.zeros((
-            len(stars), self.job.factors.shape[2] - 2)))
+        """Return stars with columns for what moves and what ties them."""
+        n, bands = len(stars), self.job.bands
+        alike = np.full(n, np.unique(bands).size < bands.size)
+        return stars.replaced(
+            rate=np.zeros((n, self.job.factors.shape[2] - 2)),
+            constant=alike, tied=alike.copy())
 
     def _places(self):
         """Return what places are made of (n, p)."""
@@ -174,6 +199,36 @@ class ManyTile:
         light, known = self.equations.summed(self.fluxes)
         self.stars.flux = np.divide(light, known, where=known > 0,
                                     out=np.zeros(known.size))
+
+    def _tie(self):
+        """Choose which stars have one flux in all images of a band."""
+        stars = self.stars
+        error = self.equations.flux_errors(alone=True)
+        sure = (error > 0) & (self.fluxes > _SURE * error)
+        tied = stars.constant & ~sure.any(axis=0)
+        new = tied & ~stars.tied
+        stars.tied = tied
+        for scale, model in zip(self.job.scales, self.models, strict=True):
+            model.stars.flux[new] = scale * stars.flux[new]
+
+    def _find_variable(self):
+        """Look for stars that one flux for a band does not explain."""
+        gradient, own = (np.array(part) for part in zip(*(
+            (one.stars.gradient[:, 0], one.stars.matrix[:, 0, 0])
+            for one in self.equations.each), strict=True))
+        bands, seen = self.job.bands, own > 0
+        square = np.divide(gradient**2, own, where=seen,
+                           out=np.zeros(own.shape)).sum(axis=0)
+        free = seen.sum(axis=0) - sum(
+            seen[bands == one].any(axis=0) for one in np.unique(bands))
+        self.stars.constant &= square < chi2.isf(_CONSTANT,
+                                                 np.maximum(free, 1))
+
+    def measure(self):
+        """Find the fluxes of all images at the places that there are."""
+        self.measured = self.fluxes
+        if self.stars.tied.any():
+            self.measured = self.fluxes + self.equations.each_flux()
 
     def _connect(self, stars, slopes):
         """Take over stars of slopes (E, n, 2, 2); find who is beside whom."""
@@ -214,6 +269,7 @@ class ManyTile:
 
     def refresh(self):
         """Bring everything up to date with the stars."""
+        self._tie()
         own = self._seen(self.stars, self.fluxes)
         self._connect(self.stars, self._slopes(self.stars))
         for model, stars in zip(self.models, own, strict=True):
@@ -224,6 +280,7 @@ class ManyTile:
     def admit(self, found, fluxes):
         """Add stars of fluxes (E, n); the others stay as they are."""
         found = self._at_rest(found)
+        fluxes = np.where(found.tied, self.scales * found.flux, fluxes)
         self._connect(Stars.joined([self.stars, found]), [
             np.concatenate([model.slopes, new]) for model, new in zip(
                 self.models, self._slopes(found), strict=True)])
@@ -245,11 +302,9 @@ class ManyTile:
 
     def brighten(self, first):
         """Give stars from the first on the fluxes that residuals hold."""
-        for model, one in zip(self.models, self.equations.each, strict=True):
-            known = one.stars.matrix[first:, 0, 0]
-            model.stars.flux[first:] += np.divide(
-                one.stars.gradient[first:, 0], known, where=known > 0,
-                out=np.zeros(known.size))
+        light = self.equations.residual_fluxes()[:, first:]
+        for model, more in zip(self.models, light, strict=True):
+            model.stars.flux[first:] += more
         self.refresh()
 
     def bind(self, which, entries):
@@ -298,6 +353,7 @@ class ManyTile:
             self._polish_once(damping, region)
             if not (self.moved > REST).any():
                 break
+        self._find_variable()
 
     def _trust_region(self):
         """Return limits (2, E, n) of fluxes and (2, n, p) of places."""

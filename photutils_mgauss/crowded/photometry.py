@@ -340,7 +340,8 @@ class CrowdedMixturePhotometry:
             The stars to report, with ``ra`` and ``dec`` [deg]. None is added,
             none left out, and the result has their order.
         motions : bool, optional
-            Whether each star has a proper motion of its own; for `ImageEpoch`.
+            Whether each star has a proper motion of its own; for
+            `ImageEpoch`, whose ``band`` tells filters apart.
 
         Returns
         -------

@@ -40,6 +40,7 @@ __getattr__, __dir__, __all__ = hand_on(__name__, {
     'Evidence': 'crowded_many',
     'Phases': 'crowded_many',
     'Points': 'crowded_many',
+    'Ties': 'crowded_many',
     'Together': 'crowded_many',
     'add_places': 'crowded_many',
     'advance': 'crowded_many',

@@ -225,34 +225,158 @@ def _divide(i, together, stars, pairs, factors, where, work):
             share[a, b] = value / light[a, a]
 
 
-@kernel(allocates=True)
-def add_places(first, stars, pairs, factors, together):
+class Ties(NamedTuple):
     """
-    Add what an image says of places, its fluxes free, to together.free.
+    Which fluxes (E, n) are one unknown, and how images see it.
 
-    Of stars from the first on; members are made here and stay.
+    The flux of star i in image k is scale[k, i] times number slot[k, i] of
+    the unknowns, of which there are ``size``; first[k, i] says whether k is
+    the first image with that number.
     """
-    m, p = together.members.shape[1], factors.shape[1]
-    work = Work(np.empty((3 * m, 3 * m)), np.empty((m, m)),
-                np.empty((m, p * m)), np.empty(m))
-    where = np.full(stars.matrix.shape[0], -1)
+
+    slot: np.ndarray
+    scale: np.ndarray
+    first: np.ndarray
+    size: int
+
+
+class Fluxes(NamedTuple):
+    """
+    Scratch: the fluxes of some stars in all images as unknowns of their own.
+
+    local (E, m) are their numbers, start (s,) the first that each is coupled
+    to, matrix (s, s), share (s, p m) and scale (s,) as in `Work`.
+    """
+
+    local: np.ndarray
+    start: np.ndarray
+    matrix: np.ndarray
+    share: np.ndarray
+    scale: np.ndarray
+
+
+@inner
+def _number(members, count, ties, local, start):
+    """
+    Give the fluxes of some stars numbers, and return how many there are.
+
+    Those of one image alone come first, image by image: these are coupled to
+    those of their image only.
+    """
+    n_images, size = local.shape[0], 0
+    for k in range(n_images):
+        low = size
+        for a in range(count):
+            i = members[a]
+            local[k, a] = -1
+            alone = ties.first[k, i]
+            for j in range(k + 1, n_images):
+                alone = alone and ties.slot[j, i] != ties.slot[k, i]
+            if alone:
+                local[k, a], start[size] = size, low
+                size += 1
+    for k in range(n_images):
+        for a in range(count):
+            i = members[a]
+            if local[k, a] >= 0:
+                continue
+            for j in range(k):
+                if ties.slot[j, i] == ties.slot[k, i]:
+                    local[k, a] = local[j, a]
+            if local[k, a] < 0:
+                local[k, a], start[size] = size, 0
+                size += 1
+    return size
+
+
+@inner
+def _factor(size, fluxes, columns):
+    """
+    Make the matrix of fluxes its factor, share what that leaves of share.
+
+    Its diagonal becomes 1 before. Nothing is looked at left of start.
+    """
+    _, start, a, share, scale = fluxes
+    for r in range(size):
+        scale[r] = 1 / sqrt(a[r, r]) if a[r, r] > 0 else 0.0
+    for r in range(size):
+        for c in range(start[r], r):
+            value = a[r, c] * scale[r] * scale[c]
+            for d in range(max(start[r], start[c]), c):
+                value -= a[r, d] * a[c, d]
+            a[r, c] = value / a[c, c]
+        pivot = 1.0
+        for d in range(start[r], r):
+            pivot -= a[r, d] * a[r, d]
+        # A flux that is lost to rounding is taken to be known.
+        a[r, r] = sqrt(pivot) if pivot > 1e-12 else 1e15
+        for b in range(columns):
+            value = scale[r] * share[r, b]
+            for d in range(start[r], r):
+                value -= a[r, d] * share[d, b]
+            share[r, b] = value / a[r, r]
+
+
+@inner
+def _add_image(k, count, factors, scale, members, whole, fluxes, free):
+    """Add the matrix of an image to those of fluxes, share and free."""
+    p = factors.shape[2]
+    local = fluxes.local
+    for a in range(count):
+        own, row = scale[k, members[a]], local[k, a]
+        for b in range(count):
+            fluxes.matrix[row, local[k, b]] += (
+                own * scale[k, members[b]] * whole[3 * a, 3 * b])
+            for q in range(p):
+                fluxes.share[row, p * b + q] += own * (
+                    whole[3 * a, 3 * b + 1] * factors[k, 0, q]
+                    + whole[3 * a, 3 * b + 2] * factors[k, 1, q])
+    for a in range(p * count):
+        at, q = 3 * (a // p), a % p
+        for b in range(a + 1):
+            to, r = 3 * (b // p), b % p
+            for c in range(2):
+                for d in range(2):
+                    free[a, b] += (factors[k, c, q] * factors[k, d, r]
+                                   * whole[at + 1 + c, to + 1 + d])
+
+
+@kernel(allocates=True)
+def add_places(first, stars, pairs, factors, ties, together):
+    """
+    Add what all images say of places, fluxes free, to together.free.
+
+    Of stars from the first on; members are made here and stay. The matrix (E,
+    n, 3, 3) and the blocks of stars have all images.
+    """
+    (n_images, _, p), m = factors.shape, together.members.shape[1]
+    whole = np.empty((3 * m, 3 * m))
+    most = n_images * m
+    fluxes = Fluxes(np.empty((n_images, m), np.int64),
+                    np.empty(most, np.int64), np.empty((most, most)),
+                    np.empty((most, p * m)), np.empty(most))
+    where = np.full(stars.matrix.shape[1], -1)
     for i in range(together.count.size):
-        together.count[i] = members_of(
-            first + i, pairs.indptr, pairs.neighbour, together.members[i])
-        _divide(i, together, stars, pairs, factors, where, work)
-        count = together.count[i]
+        members, free = together.members[i], together.free[i]
+        count = together.count[i] = members_of(
+            first + i, pairs.indptr, pairs.neighbour, members)
+        size = _number(members, count, ties, fluxes.local, fluxes.start)
+        for r in range(size):
+            for c in range(size):
+                fluxes.matrix[r, c] = 0.0
+            for c in range(p * count):
+                fluxes.share[r, c] = 0.0
+        for k in range(n_images):
+            joint_matrix(members, count, stars.matrix[k], stars.blocks[k],
+                         pairs.indptr, pairs.neighbour, where, whole)
+            _add_image(k, count, factors, ties.scale, members, whole, fluxes,
+                       free)
+        _factor(size, fluxes, p * count)
         for a in range(p * count):
-            at, q = 3 * (a // p), a % p
-            for b in range(p * count):
-                to, r = 3 * (b // p), b % p
-                value = 0.0
-                for c in range(2):
-                    for d in range(2):
-                        value += (factors[c, q] * factors[d, r]
-                                  * work.whole[at + 1 + c, to + 1 + d])
-                for c in range(count):
-                    value -= work.share[c, a] * work.share[c, b]
-                together.free[i, a, b] += value
+            for b in range(a + 1):
+                for s in range(size):
+                    free[a, b] -= fluxes.share[s, a] * fluxes.share[s, b]
+                free[b, a] = free[a, b]
 
 
 @kernel(allocates=True)
@@ -331,22 +455,23 @@ def _light_column(s, count, work, out):
 
 
 # The unknowns of the equations of E images with n stars are one flat vector:
-# n fluxes of each image, p numbers for the places of each star, then the
-# levels of the nodes of each image's background.
+# the fluxes, p numbers for the places of each star, then the levels of the
+# nodes of each image's background.
 
 @kernel
-def apply_shared(k, factors, first, v, stars, pairs, mesh, scratch, out):
+def apply_shared(k, factors, ties, first, v, stars, pairs, mesh, scratch,
+                 out):
     """
     Add the product of the equations of image k with v to out.
 
     factors (E, 2, p) are those of all images. Its levels begin at first;
     scratch is (2, 3 n + m).
     """
-    n, (n_images, _, p) = stars.matrix.shape[0], factors.shape
+    n, p = stars.matrix.shape[0], factors.shape[2]
     own, product = scratch[0], scratch[1]
-    light, place = k * n, n_images * n
+    slot, scale, place = ties.slot, ties.scale, ties.size
     for i in range(n):
-        own[3 * i] = v[light + i]
+        own[3 * i] = scale[k, i] * v[slot[k, i]]
         x = y = 0.0
         for q in range(p):
             x += factors[k, 0, q] * v[place + p * i + q]
@@ -357,7 +482,7 @@ def apply_shared(k, factors, first, v, stars, pairs, mesh, scratch, out):
         own[3 * n + i] = v[first + i]
     apply_joint(own, stars, pairs, mesh, product)
     for i in range(n):
-        out[light + i] += product[3 * i]
+        out[slot[k, i]] += scale[k, i] * product[3 * i]
         for q in range(p):
             out[place + p * i + q] += (
                 factors[k, 0, q] * product[3 * i + 1]
@@ -370,11 +495,13 @@ class Blocks(NamedTuple):
     """
     What the inverses of stars' own blocks, and of nodes, are made of.
 
-    The inverse of each flux's diagonal, own (E, n), what couples fluxes to
-    places, share (E, n, p), the inverse of what is left of the places' blocks,
-    free (n, p, p), and that of the nodes' diagonals, level (m,).
+    Which fluxes are one, ties, the inverse of the diagonal of each, own (E,
+    n), where it comes first, what couples these to places, share (E, n, p),
+    the inverse of what is left of the places' blocks, free (n, p, p), and that
+    of the nodes' diagonals, level (m,).
     """
 
+    ties: Ties
     own: np.ndarray
     share: np.ndarray
     free: np.ndarray
@@ -384,27 +511,32 @@ class Blocks(NamedTuple):
 @kernel(allocates=True)
 def precondition_shared(blocks, r, z):
     """Put the inverse blocks times r into z; return the product of both."""
-    own, share, free, level = blocks
+    ties, own, share, free, level = blocks
     (n_images, n), p = own.shape, free.shape[1]
-    place, left = n_images * n, np.empty(p)
+    place, left = ties.size, np.empty(p)
     product = 0.0
     for i in range(n):
         at = place + p * i
         for q in range(p):
             left[q] = r[at + q]
             for k in range(n_images):
-                left[q] -= share[k, i, q] * r[k * n + i] * own[k, i]
+                if ties.first[k, i]:
+                    left[q] -= (share[k, i, q] * r[ties.slot[k, i]]
+                                * own[k, i])
         for q in range(p):
             z[at + q] = 0.0
             for s in range(p):
                 z[at + q] += free[i, q, s] * left[s]
             product += r[at + q] * z[at + q]
         for k in range(n_images):
-            light = r[k * n + i]
+            if not ties.first[k, i]:
+                continue
+            slot = ties.slot[k, i]
+            light = r[slot]
             for q in range(p):
                 light -= share[k, i, q] * z[at + q]
-            z[k * n + i] = own[k, i] * light
-            product += r[k * n + i] * z[k * n + i]
+            z[slot] = own[k, i] * light
+            product += r[slot] * z[slot]
     first = place + p * n
     for m in range(level.size):
         z[first + m] = r[first + m] * level[m]

@@ -444,7 +444,7 @@ class Field:
     ``pixels`` are `PixelData` with errors, ``psfs`` models of fixed shape or
     None, ``grid`` is the `~photutils_mgauss.sky.pixel_grid.PixelGrid` that
     all have in common, ``years`` (E,) are the times, or None where images
-    come without.
+    come without, ``bands`` (E,) names of filters, or ''.
     """
 
     pixels: list
@@ -452,6 +452,7 @@ class Field:
     unit: object
     grid: PixelGrid
     years: np.ndarray | None
+    bands: np.ndarray
 
     def time_since_mean(self):
         """Return how long after the mean time images were taken (E,) [yr]."""
@@ -488,7 +489,9 @@ def read_field(images):
     grid = PixelGrid.of(frames, [one.shape for one in pixels])
     years = [getattr(one, 'year', None) for one in images]
     return Field([one.with_error() for one in pixels], list(psfs), units[0],
-                 grid, None if None in years else np.array(years))
+                 grid, None if None in years else np.array(years),
+                 np.array([getattr(one, 'band', None) or ''
+                           for one in images]))
 
 
 def _read_any(entry):

@@ -117,7 +117,7 @@ def _bias(campaign, solved, rows, covariance):
     return np.minimum(out, 0.5)
 
 
-def frame_covariance(solution, campaign, solved, plain, refined=None):
+def frame_covariance(known, campaign, solved, plain, refined=None):
     r"""
     Return what the errors of frames add to covariances, (p, p, n).
 
@@ -126,7 +126,7 @@ def frame_covariance(solution, campaign, solved, plain, refined=None):
 
     Parameters
     ----------
-    solution : `~photutils_mgauss.motions.solution.MotionSolution`
+    known : `~photutils_mgauss.motions.frame_errors.FrameErrors`
         The frames are those of the WCS of the images.
     campaign, solved, plain
         The images, the stars, and the inverses of their matrices.
@@ -134,17 +134,12 @@ def frame_covariance(solution, campaign, solved, plain, refined=None):
         Where the pixels have given frames, what is left are those errors
         that all stars follow, as a map of the plane.
     """
-    fit = solution._fit
-    epochs = _epochs_of(solution, campaign)
-    frames, transform = fit.frames, fit.setup.transform
-    size = frames.factor.shape[1]
-    factor = frames.factor.reshape(len(solution.epochs), 2, -1, size)
-    place = fit.setup.sightings.plane.project(
+    place = known.plane.project(
         campaign.plane.deproject(solved.values[:, :2].T))
-    basis = np.nan_to_num(transform.basis(place))
+    basis = np.nan_to_num(known.transform.basis(place))
     total = 0.0
-    for k, e in enumerate(epochs):
-        moved = np.einsum('xbq,bn->nxq', factor[e], basis)
+    for k, e in enumerate(_epochs_of(known, campaign)):
+        moved = np.einsum('xbq,bn->nxq', known.factor[e], basis)
         total += _answers(solved, plain, k, np.einsum(
             'nix,nxq->niq', solved.slopes[:, k, :, :2], moved))
     if refined is not None:
@@ -203,13 +198,9 @@ def _psf_shifts(campaign, solved, k, fit_shape, executor):
     return out
 
 
-def _epochs_of(solution, campaign):
-    """Return the number of the epoch of a solution for each image."""
-    if solution._fit.setup.sightings.plane is None:
-        msg = 'references must be a MotionSolution on the sky, got a plane'
-        raise ValueError(msg)
-    years = np.array([epoch.mean_year for epoch in solution.epochs])
-    found = []
+def _epochs_of(known, campaign):
+    """Return the number of the epoch of known frames for each image."""
+    years, found = known.years, []
     for k, year in enumerate(campaign.years):
         away = np.abs(years - year)
         e = int(np.argmin(away))

@@ -16,6 +16,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from scipy.spatial import cKDTree
 
 from photutils_mgauss.motions import MotionSolution
+from photutils_mgauss.motions.frame_errors import FrameErrors
 from photutils_mgauss.pixel_motions.campaign import read_campaign
 from photutils_mgauss.pixel_motions.errors import (
     errors_of,
@@ -280,12 +281,18 @@ class PixelMotionFitter:
             covariance = covariance + frames.covariance(campaign, solved)
         if self.references is not None:
             covariance = covariance + frame_covariance(
-                self.references, campaign, solved, errors.plain, frames)
+                self._known_frames(), campaign, solved, errors.plain, frames)
         return replace(errors, covariance=covariance)
+
+    def _known_frames(self):
+        """Return the `FrameErrors` of the references."""
+        if isinstance(self.references, FrameErrors):
+            return self.references
+        return FrameErrors.of(self.references)
 
     def _is_relative(self):
         return (self.references is not None
-                and self.references._fit.setup.relative)
+                and self._known_frames().relative)
 
     def _check(self):
         as_choice(self.flux, 'flux', FLUXES)
@@ -300,7 +307,8 @@ class PixelMotionFitter:
         if self.refine_frames and self.forced:
             msg = 'refine_frames must be False with forced=True, got True'
             raise ValueError(msg)
-        if not isinstance(self.references, MotionSolution | None):
+        if not isinstance(self.references,
+                          MotionSolution | FrameErrors | None):
             msg = ('references must be the MotionSolution that the WCS of the '
                    f'images come from, got {type(self.references).__name__}')
             raise TypeError(msg)

@@ -150,7 +150,8 @@ def test_catalogues_have_places_on_the_sky_that_are_true(chain):
 
 def test_catalogues_become_true_motions(chain):
     assert files_in(chain / 'motions') == [
-        'alignment.ecsv', 'motions.ecsv', 'night1_wcs.fits',
+        'alignment.ecsv', 'frame_errors.ecsv', 'motions.ecsv',
+        'night1_wcs.fits',
         'night2_wcs.fits', 'residuals.ecsv']
     table = QTable.read(chain / 'motions' / 'motions.ecsv')
     assert table.meta['mgauss']['options']['references'] == (
@@ -198,7 +199,8 @@ def test_images_become_motions_in_one_command(chain):
                   folder=chain)
     assert 'stars have proper motions' in run.stdout
     assert files_in(chain / 'direct') == [
-        'alignment.fits', 'motions.fits', 'night1_cat.fits',
+        'alignment.fits', 'frame_errors.fits', 'motions.fits',
+        'night1_cat.fits',
         'night1_psf.fits', 'night1_wcs.asdf', 'night2_cat.fits',
         'night2_psf.fits', 'night2_wcs.asdf', 'residuals.fits']
     table = QTable.read(chain / 'direct' / 'motions.fits')

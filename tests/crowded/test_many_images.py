@@ -100,7 +100,8 @@ def pair_up(table, sky, radius=0.6):
     return true, row[true]
 
 
-def small_tile(x, y, fluxes, frames=WCS_OF[:2], shape=(31, 31)):
+def small_tile(x, y, fluxes, frames=WCS_OF[:2], shape=(31, 31), *,
+               scales=None, bands=None, factors=None):
     """Return a tile without noise or sky, and maps to its images."""
     shift = [WCS.deepcopy(one) for one in frames]
     for one in shift:
@@ -114,9 +115,11 @@ def small_tile(x, y, fluxes, frames=WCS_OF[:2], shape=(31, 31)):
                              OPTIONS, (0, 0), None))
         maps.append(TileMap(to_image, grid.to_grid[k], (0, 0), (0, 0)))
     n = len(fluxes)
-    return ManyTile(ManyJob(parts, maps, np.arange(n), np.ones(n),
-                            np.tile(np.eye(2), (n, 1, 1)), OPTIONS,
-                            grid.shape, (0, 0), None, n))
+    scales = np.ones(n) if scales is None else np.array(scales)
+    bands = np.arange(n) if bands is None else np.array(bands)
+    factors = np.tile(np.eye(2), (n, 1, 1)) if factors is None else factors
+    return ManyTile(ManyJob(parts, maps, np.arange(n), scales, factors, bands,
+                            OPTIONS, grid.shape, (0, 0), None, n))
 
 
 X, Y = np.array([14.2, 16.1, 20.5]), np.array([18.1, 16.6, 17.0])
@@ -140,13 +143,15 @@ def design(tile, k, x, y, flux):
 
 
 def dense(tile, x, y, fluxes):
-    """Return the normal matrix of fluxes (E, n), then places (n, 2)."""
-    n, n_images = x.size, len(fluxes)
-    size = n * (n_images + 2)
+    """Return the normal matrix of fluxes (E, n), then places (n, p)."""
+    n, n_images, p = x.size, len(fluxes), tile.job.factors.shape[2]
+    size = n * (n_images + p)
     matrix = np.zeros((size, size))
-    place = n * n_images + np.arange(2 * n).reshape(n, 2)
+    place = n * n_images + np.arange(p * n).reshape(n, p)
     for k, flux in enumerate(fluxes):
-        a = design(tile, k, x, y, flux)
+        a = design(tile, k, x, y, flux).reshape(-1, n, 3)
+        a = np.concatenate([a[:, :, :1], a[:, :, 1:] @ tile.job.factors[k]],
+                           axis=2).reshape(len(a), -1)
         at = np.column_stack([k * n + np.arange(n), place]).ravel()
         matrix[np.ix_(at, at)] += a.T @ a
     return matrix
@@ -187,6 +192,89 @@ def test_gauss_newton_finds_a_noiseless_blend_again():
     assert_allclose(tile.stars.x, X, atol=1e-4)
     assert_allclose(tile.stars.y, Y, atol=1e-4)
     assert_allclose(tile.fluxes, FLUXES, rtol=1e-3)
+
+
+# Two images of a band, the second of 0.7 of the light, a year before and after
+# the mean time. The last star varies.
+SCALES = np.array([1.0, 0.7])
+ALIKE = np.array([90.0, 60.0, 80.0]) * SCALES[:, None]
+TIED = np.array([True, True, False])
+NEAR_X, NEAR_Y = np.array([14.2, 15.3, 16.5]), np.array([18.1, 17.6, 16.7])
+MOVING = np.array([np.column_stack([np.eye(2), dt * np.eye(2)])
+                   for dt in (-1, 1)])
+
+
+def tied_tile(fluxes):
+    tile = small_tile(NEAR_X, NEAR_Y, fluxes, scales=SCALES, bands=[0, 0],
+                      factors=MOVING)
+    begin(tile, NEAR_X, NEAR_Y, ALIKE)
+    return tile
+
+
+def begin(tile, x, y, fluxes):
+    """Start a tile with some stars tied."""
+    tile.start(Stars(x, y, fluxes[0]), fluxes)
+    tile.stars.constant = tile.stars.tied = TIED.copy()
+    tile.refresh()
+
+
+def joined():
+    """Return how fluxes (2, 3), then places, are made of what is free."""
+    out = np.zeros((18, 16))
+    for i in range(3):
+        out[i, i] = 1
+        out[3 + i, i if TIED[i] else 3] = SCALES[1] if TIED[i] else 1
+    out[6:, 4:] = np.eye(12)
+    return out
+
+
+def test_fluxes_of_a_band_are_one_unknown():
+    tile = tied_tile(ALIKE)
+    start = ALIKE + np.array([[5, -3, 2], [3.5, -2.1, -4]])
+    begin(tile, NEAR_X + 0.004, NEAR_Y - 0.003, start)
+    light, place, _ = tile.equations.solve(0.0)
+    assert_allclose(light, ALIKE - start, atol=0.15)
+    assert_allclose(light[1, :2], 0.7 * light[0, :2], rtol=1e-12)
+    assert_allclose(place, np.tile([-0.004, 0.003, 0, 0], (3, 1)), atol=2e-3)
+
+
+def test_places_are_better_known_where_fluxes_are_one():
+    tile = tied_tile(ALIKE)
+    place, _, _ = tile.equations.covariances()
+    whole = dense(tile, NEAR_X, NEAR_Y, ALIKE)
+    exact = np.linalg.inv(joined().T @ whole @ joined())
+    for i in range(3):
+        at = 4 + 4 * i + np.arange(4)
+        assert_allclose(place[i], exact[np.ix_(at, at)], rtol=0.05,
+                        atol=0.02 * np.trace(exact[np.ix_(at, at)]))
+    free = np.linalg.inv(whole)[6:10, 6:10]
+    assert np.trace(place[0]) < 0.9 * np.trace(free)
+
+
+def test_each_flux_is_measured_where_one_was_fitted():
+    fluxes = ALIKE * np.array([[1.3, 0.9, 1.0], [0.8, 1.1, 1.5]])
+    tile = tied_tile(fluxes)
+    tile.measure()
+    assert_allclose(tile.measured, fluxes, rtol=5e-3)
+
+
+def test_only_stars_that_vary_or_are_bright_get_their_own_fluxes():
+    fluxes = ALIKE * np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 2.0]])
+    tile = small_tile(X, Y, fluxes, scales=SCALES, bands=[0, 0])
+    tile.start(Stars(X, Y, ALIKE[0]), ALIKE)
+    assert tile.stars.tied.all()
+    tile.polish(0.0, 12)
+    assert tile.stars.constant.tolist() == [True, True, False]
+    tile.polish(0.0, 12)
+    assert tile.stars.tied.tolist() == [True, True, False]
+    assert_allclose(tile.fluxes, fluxes, rtol=0.01)
+    bright = small_tile(X, Y, 10 * fluxes, scales=SCALES, bands=[0, 0])
+    bright.start(Stars(X, Y, 10 * ALIKE[0]), 10 * ALIKE)
+    bright.refresh()
+    assert not bright.stars.tied.any()
+    other = small_tile(X, Y, fluxes, scales=SCALES, bands=[0, 1])
+    other.start(Stars(X, Y, ALIKE[0]), ALIKE)
+    assert not other.stars.tied.any()
 
 
 def test_a_grid_knows_the_pixels_of_all_images(rng):
@@ -361,6 +449,32 @@ def test_motions_of_crowded_stars_are_fitted_with_their_errors():
             f'{name}_error'][row].value
         assert 0.7 < 1.48 * np.nanmedian(np.abs(pull[good])) < 1.4
     assert_allclose(table['ref_epoch'].value, 2028)
+
+
+def test_a_variable_star_among_faint_ones_keeps_its_fluxes():
+    rng = np.random.default_rng(21)
+    places, motion = rng.uniform(3, 60, (2, 60)), rng.normal(0, 0.06, (2, 60))
+    places[:, 0] = 30.0, 31.0
+    flux = np.tile(10**rng.uniform(2.4, 3.2, 60), (5, 1))
+    flux[:, 0] = 600, 600, 3000, 600, 1200
+    images = []
+    for k, year in enumerate((-2.0, -1.0, 0.0, 1.0, 2.0)):
+        wcs = WCS_OF[k % 3]
+        image = SKY + draw(SHARP, *wcs.world_to_pixel(WCS_OF[0].pixel_to_world(
+            *(places + motion * year))), flux[k], (64, 64))
+        images.append(ImageEpoch(
+            rng.normal(image, np.sqrt(image)), PSFS[0], wcs, 2028.0 + year,
+            error=np.sqrt(image), band='g'))
+    table = CrowdedMixturePhotometry(None).fit_images(images, motions=True)
+    x, y = WCS_OF[0].world_to_pixel(SkyCoord(table['ra'], table['dec']))
+    away, row = cKDTree(np.column_stack([x, y])).query(places.T)
+    assert away[0] < 0.3
+    pull = (table['flux'][row[0]] - flux[:, 0]) / table['flux_err'][row[0]]
+    assert np.abs(pull).max() < 4
+    good = away < 0.4
+    pull = (table['flux'][row[good]] - flux.T[good]) / table['flux_err'][
+        row[good]]
+    assert 0.7 < 1.48 * np.nanmedian(np.abs(pull)) < 1.4
 
 
 def test_motions_need_times(field):

@@ -3,15 +3,26 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
+from numpy.testing import assert_allclose, assert_array_equal
 
 from photutils_mgauss import (
+    Epoch,
+    ImageEpoch,
     Instrument,
+    PixelMotionFitter,
+    ProperMotionFitter,
     paper_exposures,
     simulate_epochs,
     sky_field,
 )
 from photutils_mgauss.cli import main
-from photutils_mgauss.cli.psf_files import write_psf
+from photutils_mgauss.cli.motions import wcs_writer
+from photutils_mgauss.cli.psf_files import read_psf, write_psf
+from photutils_mgauss.cli.star_image import Reading, read_image
+from photutils_mgauss.files.image_layers import read_wcs
+from photutils_mgauss.motions.frame_errors import FrameErrors
+from photutils_mgauss.sky.tangent_plane import TangentPlane
+from photutils_mgauss.sky.transforms import Transform
 
 NIGHTS = ('night1', 'night2', 'night3')
 
@@ -84,6 +95,76 @@ def test_the_page_shows_a_faint_star_and_the_gain(folder):
     assert gain['both'] == 5
     assert gain['median_error_catalogues'] == 0.5
     assert 0 < gain['median_error_pixels'] < 20
+
+
+def frames_of(folder):
+    """Return frames of poor measurements, and write them to a folder."""
+    true = QTable.read(folder / 'truth.ecsv')
+    rng, epochs = np.random.default_rng(3), []
+    for name, exposure in zip(NIGHTS, paper_exposures()[1::2], strict=True):
+        wcs = read_wcs(folder / f'{name}_wcs.asdf')
+        table = QTable({'id': true['id']})
+        for axis, place in zip('xy', wcs.world_to_pixel(
+                SkyCoord(true['ra'], true['dec'])), strict=True):
+            table[f'{axis}_fit'] = place + rng.normal(0, 0.05, len(true))
+            table[f'{axis}_err'] = np.full(len(true), 0.05)
+        epochs.append(Epoch(table, wcs, exposure.time))
+    solution = ProperMotionFitter(transform='shift', systematic=None,
+                                  match_by='id').fit(epochs)
+    out = folder / 'poor'
+    out.mkdir()
+    for name, epoch in zip(NIGHTS, solution.epochs, strict=True):
+        suffix, write = wcs_writer(epoch.wcs, epoch.mean_year, {})
+        write((out / f'{name}_wcs').with_suffix(suffix))
+    FrameErrors.of(solution).to_table().write(out / 'frame_errors.ecsv')
+    return solution, out
+
+
+def test_errors_of_frames_are_in_those_of_stars(folder, capsys):
+    solution, frames = frames_of(folder)
+    command = ['motions', '--pixels', *(str(folder / f'{name}.fits')
+                                        for name in NIGHTS),
+               '--psf', *(str(folder / f'{name}_psf.fits')
+                          for name in NIGHTS),
+               '--targets', str(folder / 'truth.ecsv'),
+               '--frames', str(frames), '--output']
+    assert main([*command, str(folder / 'known')]) in (0, None)
+    assert 'exact' not in capsys.readouterr().out
+    (frames / 'frame_errors.ecsv').unlink()
+    assert main([*command, str(folder / 'exact')]) in (0, None)
+    assert 'the frames count as exact' in capsys.readouterr().out
+    known, exact = (QTable.read(folder / name / 'motions.ecsv')
+                    for name in ('known', 'exact'))
+    images = []
+    for name, exposure, epoch in zip(NIGHTS, paper_exposures()[1::2],
+                                     solution.epochs, strict=True):
+        seen = read_image(folder / f'{name}.fits', Reading())
+        images.append(ImageEpoch(
+            seen.without_sky * seen.unit, read_psf(
+                folder / f'{name}_psf.fits'), epoch.wcs, exposure.time,
+            mask=seen.mask, error=seen.noise.background * seen.unit))
+    stars = QTable.read(folder / 'truth.ecsv')
+    expected = PixelMotionFitter(references=solution).fit(images, stars).stars
+    for name in ('pmra_error', 'dec_error'):
+        assert_allclose(known[name].value, expected[name].value, rtol=1e-3)
+        assert (known[name] > exact[name]).all()
+
+
+def test_errors_of_frames_are_kept_in_tables(folder, tmp_path):
+    solution = FrameErrors(
+        np.array([2024.5, 2026.0]), np.random.default_rng(1).normal(
+            size=(2, 2, 3, 4)), TangentPlane(12.5, -3.0),
+        Transform('affine', 1, (3.0, 4.0), 1e5), relative=True)
+    for name in ('a.ecsv', 'a.fits'):
+        solution.to_table().write(tmp_path / name)
+        again = FrameErrors.from_table(QTable.read(tmp_path / name))
+        assert_array_equal(again.factor, solution.factor)
+        assert_array_equal(again.years, solution.years)
+        assert again.plane == solution.plane
+        assert again.relative
+        points = np.array([[1e4, 2.0], [3.0, -5e4]])
+        assert_allclose(again.transform.basis(points),
+                        solution.transform.basis(points))
 
 
 def test_places_given_are_kept_and_results_too(folder):
