@@ -146,6 +146,7 @@ def star_table(fit, ref_year, parameters):
     flags, solved = _flags(fit)
     table = QTable({'id': sightings.names})
     _add_parameters(table, fit, parameters, solved)
+    del parameters  # as large as the table
     table['ref_epoch'] = np.full(len(table), ref_year) * u.yr
     _add_quality(table, fit, solved)
     if fit.leak is not None:
