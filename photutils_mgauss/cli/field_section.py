@@ -29,7 +29,9 @@ def field_sections(folder, paths):
         If there is no such field, or it has none of them.
     """
     field = FieldOfExposures(folder)
-    known = [name_of(path) for path in paths if name_of(path) in field.names]
+    # A PSF and a catalogue of one exposure may have one name.
+    known = [name for name in dict.fromkeys(map(name_of, paths))
+             if name in field.names]
     if not known:
         msg = (f'{folder}: --field must be of the catalogues given, but its '
                f'exposures are {", ".join(field.names) or "not known"}')

@@ -148,10 +148,12 @@ def _star_panels(table, good, seen):
             'How well the PSF describes the stars: 1 if noise is all that '
             'is left.'))
     if seen is not None and not seen.whole:
-        x0, y0 = seen.corner
+        (x0, y0), (ny, nx) = seen.corner, seen.data.shape
+        near = (x >= x0) & (x < x0 + nx) & (y >= y0) & (y < y0 + ny)
         panels.append(Panel(
-            lambda ax: plotting.plot_detections(x - x0, y - y0, flux,
-                                                data=seen.data, ax=ax),
+            lambda ax: plotting.plot_detections(
+                x[near] - x0, y[near] - y0, flux[near], data=seen.data,
+                ax=ax),
             f'The middle of the image, from pixel {x0}, {y0}.'))
     if seen is not None and seen.residual is not None:
         what = 'the image' if seen.whole else 'the middle of the image'

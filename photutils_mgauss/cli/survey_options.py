@@ -21,6 +21,8 @@ _MEASURING = {'psf': ('n_components', 'degree', 'radius', 'min_snr',
               'photometry': ('crowded', 'threshold', 'magnitudes', 'psf')}
 _PIXELS_ONLY = ('targets', 'forced', 'refine_frames', 'fit_shape')
 _SHARED = ('parallax', 'observer')
+# Options that name a file.
+_FILES = ('references', 'targets', 'parallax_of', 'stars')
 
 
 def check_keys(path, table, known, what):
@@ -119,6 +121,16 @@ def check_overlaps(path, text):
                '"detector": it is for the PSF of each exposure')
         raise ValueError(msg)
     _check_motions(path, text)
+
+
+def check_files(path, text, folder):
+    """Raise if an option names a file that there is none of."""
+    for name in COMMANDS:
+        for key, value in text.get(name, {}).items():
+            if key in _FILES and not (folder / str(value)).is_file():
+                msg = (f'{path}: {key} of [{name}] must be a file, got '
+                       f'{value}, which is none in {folder}')
+                raise FileNotFoundError(msg)
 
 
 def _better_place(name, key):

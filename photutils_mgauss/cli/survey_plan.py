@@ -8,6 +8,7 @@ from photutils_mgauss.cli.footprints import Footprint, connected, overlaps
 from photutils_mgauss.cli.survey_options import (
     COMMANDS,
     READING,
+    check_files,
     check_keys,
     check_overlaps,
     files_of,
@@ -106,6 +107,7 @@ def read_survey(path):
     """
     text = _toml(path)
     folder = path.resolve().parent
+    check_files(path, text, folder)
     wanted = text.get('exposures', {})
     tables = _tables(text)
     given = text.get('photometry', {}).get('psf', 'exposure')

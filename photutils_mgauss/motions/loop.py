@@ -59,7 +59,9 @@ class Fit:
         is asked for.
     frames : `~photutils_mgauss.motions.frames.Frames`
     estimates : `~photutils_mgauss.motions.joint.Estimates`
-        With residuals.
+        Without residuals.
+    rms : (E, 2) `~numpy.ndarray`
+        Of the residuals of the references, NaN where there are none.
     chi2 : (n,) `~numpy.ndarray`
         Of the detections of each star and of what was known of it.
     ranks : (n,) int `~numpy.ndarray`
@@ -74,6 +76,7 @@ class Fit:
     pose_again: object
     frames: Frames
     estimates: Estimates
+    rms: np.ndarray
     chi2: np.ndarray
     ranks: np.ndarray
     leak: tuple | None
@@ -110,8 +113,26 @@ def finished(setup, state, problem, frames, estimates, pose_again):
     if observer is not None and not setup.options.parallax:
         leak = parallax_leak(replace(problem, observer=observer),
                              setup.options.executor)
-    return Fit(setup, state, pose_again, frames, estimates, chi2,
-               problem.ranks, leak)
+    rms = _reference_rms(setup, state, estimates.residuals)
+    return Fit(setup, state, pose_again, frames,
+               replace(estimates, residuals=None), rms, chi2, problem.ranks,
+               leak)
+
+
+def references_in_use(setup, state):
+    """Return which stars (n,) say where the frames are."""
+    stars = setup.anchors.copy()
+    stars[state.dropped] = False
+    return stars
+
+
+def _reference_rms(setup, state, residuals):
+    """Return the rms (E, 2) of the residuals of references."""
+    used = state.used & references_in_use(setup, state)
+    used &= np.isfinite(residuals).all(axis=0)
+    return np.array([
+        np.sqrt(np.mean(residuals[:, e, own]**2, axis=1))
+        if own.any() else [np.nan, np.nan] for e, own in enumerate(used)])
 
 
 def pose(setup, state):
