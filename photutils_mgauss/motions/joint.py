@@ -370,7 +370,8 @@ def _project(stars, e, c):
     return out
 
 
-def solve_all(problem, correction, factor, executor=None, **wanted):
+def solve_all(problem, correction, factor, executor=None, *, only=None,
+              **wanted):
     """
     Return the `Estimates` of all stars of a problem with the frames found.
 
@@ -382,6 +383,8 @@ def solve_all(problem, correction, factor, executor=None, **wanted):
     factor : (M, q) `~numpy.ndarray`
         The covariance of r is ``factor @ factor.T``.
     executor : `~concurrent.futures.Executor`, optional
+    only : sequence of str, optional
+        The fields of `Estimates` that are kept, where not all are needed.
     **wanted
         ``residuals``, ``leverage`` and ``judge``: whether to return the
         residuals, what the fit took away of their covariance, and what the
@@ -393,26 +396,30 @@ def solve_all(problem, correction, factor, executor=None, **wanted):
     # Parts go as they come, or all arrays would be there twice.
     for part in each_part(solve, problem, executor):
         if whole is None:
-            whole = _for_all(part, problem.n_stars)
+            whole = _for_all(part, problem.n_stars, only)
         stop = start + part.values.shape[1]
         for name, array in whole.items():
             array[..., start:stop] = getattr(part, name)
         start = stop
-    return Estimates(**whole)
+    return Estimates(**dict.fromkeys(('values', 'covariance')) | whole)
 
 
-def _for_all(part, n):
+def _for_all(part, n, only):
     """Return arrays for n stars, of the kinds that a part has."""
-    arrays = {field.name: getattr(part, field.name) for field in fields(part)}
+    arrays = {field.name: getattr(part, field.name) for field in fields(part)
+              if only is None or field.name in only}
     return {name: np.empty((*array.shape[:-1], n), array.dtype)
             for name, array in arrays.items() if array is not None}
 
 
 def total_chi2(problem, estimates):
     """Return the chi-square (n,) of detections and what was known before."""
-    x, y = estimates.residuals
-    xx, xy, yy = problem.weights
-    chi2 = np.sum(xx * x * x + 2 * xy * x * y + yy * y * y, axis=0)
+    chi2 = np.zeros(problem.n_stars)
+    # Epoch by epoch: products of all are as large as what was measured.
+    for (x, y), (xx, xy, yy) in zip(
+            estimates.residuals.swapaxes(0, 1),
+            problem.weights.swapaxes(0, 1), strict=True):
+        chi2 += xx * x * x + 2 * xy * x * y + yy * y * y
     priors = problem.priors
     chi2[priors.stars] += priors.chi2(estimates.values)
     return chi2

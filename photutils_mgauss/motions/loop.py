@@ -319,7 +319,8 @@ def _review(setup, state, problem, frames):
     if len(dropped):
         return replace(state, dropped=np.union1d(state.dropped,
                                                  dropped)), True
-    estimates = solve(setup, problem, frames, judge=True)
+    estimates = solve(setup, problem, frames, judge=True,
+                      only=('chi2', 'raw'))
     each = _measured_numbers(problem)
     bad = worst_outliers(estimates.chi2, state.used,
                          _spare(problem, each) & ~state.crooked,
