@@ -52,6 +52,7 @@ from photutils_mgauss.cli.survey_plan import read_survey
 from photutils_mgauss.cli.survey_tasks import exposure_tasks
 
 PARTS = ('speed', 'task', 'memory', 'kills', 'whole')
+NO_PAGES = 'pages = false\n'
 QUICK = '[psf]\nn_components = 3\ndegree = 2\n'
 TABLES = ('catalogues', 'motions', 'motions_hats/dataset', 'wcs')
 
@@ -123,7 +124,7 @@ def survey_file(folder, name, text='', top=''):
 def tiny_survey(folder):
     """Return the survey of tiny exposures, of which no pages are drawn."""
     return survey_file(folder, 'out', '[photometry]\npsf = "psf.fits"\n',
-                       'pages = false\n')
+                       NO_PAGES)
 
 
 def run_survey(path, workers, cores):
@@ -193,11 +194,11 @@ def speed(folder, options):
     (folder / 'raw').mkdir()
     write_images(folder / 'raw', options.fields, options.epochs, options.size)
     n = options.fields * options.epochs
-    warm = survey_file(folder, 'warm')
+    warm = survey_file(folder, 'warm', top=NO_PAGES)
     warm.write_text(warm.read_text().replace('raw/*', 'raw/field00*'))
     run_survey(warm, 2, 2)
-    took = {k: run_survey(survey_file(folder, f'with{k}'), k, k)
-            for k in (1, 2)}
+    took = {k: run_survey(survey_file(folder, f'with{k}', top=NO_PAGES), k,
+                          k) for k in (1, 2)}
     for k, one in took.items():
         cpu = one['driver'] + one['workers']
         print(f'{n} exposures of {options.size}^2, {k} worker(s) on {k} '
@@ -238,10 +239,9 @@ def whole(folder, options):
     n = options.fields * options.epochs
     print(f'{n} exposures are simulated in {time.perf_counter() - start:.0f}'
           ' s', flush=True)
-    pages = str(options.pages).lower()
     path = survey_file(
         folder, 'out', f'detector = "DETECTOR"\n{QUICK}[motions]\n'
-        'references = "quasars.ecsv"\n', f'pages = {pages}\n')
+        'references = "quasars.ecsv"\n', '' if options.pages else NO_PAGES)
     took = run_survey(path, 2, 2)
     print(f'{n} exposures of {options.size}^2 by 2 workers on 2 cores: '
           f'{took["seconds"]:.0f} s, {60 * n / took["seconds"]:.2f} a '
