@@ -10,7 +10,7 @@ from photutils_mgauss.cli import chips, photometry, pixel_motions, tools
 from photutils_mgauss.cli import psf as psf_command
 from photutils_mgauss.cli.observers import check_observer, observer_at
 from photutils_mgauss.cli.progress import Progress
-from photutils_mgauss.cli.psf_stars import check_image
+from photutils_mgauss.cli.psf_stars import check_image, check_start
 from photutils_mgauss.cli.results import (
     Results,
     add_checkpoint,
@@ -161,7 +161,9 @@ def run(options):
         step(f'write to {folder}')
         record = tools.record_of(
             options, notes=list(solution.notes),
-            exposures=[Path(seen[own[0]].image).name for own in exposures])
+            exposures=[Path(seen[own[0]].image).name for own in exposures],
+            pieces={tools.stem(pieces[k].name): [epoch, seen[k].ext]
+                    for epoch, own in enumerate(exposures) for k in own})
         _collect(solution, names, exposures, record, results)
         # Nothing is written before all is well.
         results.deliver()
@@ -173,7 +175,8 @@ def _check(options):
     pixel_motions.check_alone(options)
     chips.check(options)
     tools.check_inputs([*options.inputs, options.references, options.stars,
-                        options.parallax_of])
+                        options.start, options.parallax_of])
+    check_start(options)
     if options.parallax_of and (options.references or options.plane):
         msg = ('--parallax-of must be given without --references and '
                '--plane: its table has the references')
@@ -253,7 +256,8 @@ def _check_image(options, image):
 def _from_image(options, image, names, k, results):
     """Return what is seen in an image."""
     key = results.key(file_marks(image.path, image.reading.wcs,
-                                 options.stars), image.content)
+                                 options.stars, options.start),
+                      image.content)
     psf = results.obtain(names.psfs[k], key, partial(
         psf_command.make, options, image), psf_command.read)
     name = names.catalogues[k]

@@ -5,6 +5,7 @@ from photutils_mgauss.cli import psf_together, tools
 from photutils_mgauss.cli.progress import Progress
 from photutils_mgauss.cli.psf_stars import (
     check_image,
+    check_start,
     choose,
     fit_options,
     no_stars,
@@ -64,6 +65,10 @@ def add_fit(parser):
     group.add_argument('--stars', metavar='TABLE',
                        help='table with x, y of the stars to look at, '
                             'instead of detection')
+    group.add_argument('--start', metavar='PSF',
+                       help='a PSF file, as from an archive, that the stars '
+                            'change: fifteen are enough (with a degree of '
+                            '1 by default, and its Gaussians)')
     return group
 
 
@@ -79,7 +84,8 @@ def _add_files(parser):
 def run(options):
     """Make the PSFs."""
     paths = options.inputs
-    tools.check_inputs([*paths, options.stars])
+    tools.check_inputs([*paths, options.stars, options.start])
+    check_start(options)
     tools.check_different(paths)
     if options.together:
         psf_together.run(options)
@@ -98,7 +104,8 @@ def run(options):
         for i, (path, name) in enumerate(zip(paths, names, strict=True)):
             step(f'PSF of {path}')
             image = read(i) if kinds[i] == 'image' else None
-            key = results.key(file_marks(path, options.stars),
+            key = results.key(file_marks(path, options.stars,
+                                         options.start),
                               image and image.content)
             results.obtain(name, key, partial(_make, options, path, image,
                                               kinds[i]))
@@ -114,6 +121,10 @@ def _kind(options, path, read):
     if kind != 'image':
         if options.n_components == 'auto':
             msg = f'{path}: --n-components must be a number for PSF files'
+            raise ValueError(msg)
+        if options.start is not None:
+            msg = (f'{path}: must be an image of stars for --start, but is a '
+                   'PSF')
             raise ValueError(msg)
         return kind
     if options.oversampling is not None:
@@ -182,13 +193,14 @@ def _from_stars(image, options):
         image.without_sky, stars, error=image.noise.total, mask=image.mask,
         effective_gain=image.noise.gain, **fit)
     used = field.stars[field.stars['used']]
+    grid = field.to_grid(tuple(options.grid_shape))
     found = {'kind': 'image', 'n_stars': len(used),
-             'n_components': field.n_components, 'degree': field.degree,
+             'n_components': grid.n_components, 'degree': field.degree,
              'accuracy': float(field.accuracy),
              'reading': image.layers.sources,
              'stars': [[round(float(x), 2), round(float(y), 2)]
                        for x, y in zip(used['x'], used['y'], strict=True)]}
-    return field.to_grid(tuple(options.grid_shape)), found
+    return grid, found
 
 
 def _describe(psf, found):

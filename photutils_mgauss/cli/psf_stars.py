@@ -10,10 +10,22 @@ def check_image(image):
         image.check()
 
 
+def check_start(options):
+    """Raise for options that a PSF to start from leaves no room for."""
+    if options.start is not None and options.n_components is not None:
+        msg = ('--n-components must be left out with --start, whose Gaussians '
+               f'are kept; got {options.n_components}')
+        raise ValueError(msg)
+
+
 def fit_options(options):
     """Return the options of `fit_mixture_field` that are given."""
+    from photutils_mgauss.cli.psf_files import read_psf
     given = {name: getattr(options, name)
              for name in ('n_components', 'degree', 'radius')}
+    if options.start is not None:
+        with tools.about(options.start):
+            given['start'] = read_psf(options.start)
     return {'radius': _RADIUS} | {name: value for name, value
                                   in given.items() if value is not None}
 

@@ -24,9 +24,10 @@ def add_option(group):
 def run(options):
     """Make the PSFs of all images, from the stars of all."""
     paths = options.inputs
-    if options.stars is not None:
-        msg = '--together must be given without --stars'
-        raise ValueError(msg)
+    for name in ('stars', 'start'):
+        if getattr(options, name) is not None:
+            msg = f'--together must be given without --{name}'
+            raise ValueError(msg)
     names = tools.output_names(paths, options.output, '_psf', (), '.fits')
     read = tools.read_images(options, paths)
     results = Results(options)

@@ -20,6 +20,10 @@ def add(commands):
                         metavar='FILE', help='default: %(default)s')
     parser.add_argument('--title', default='Positions and proper motions',
                         help='of the page (default: %(default)s)')
+    parser.add_argument('--field', metavar='FOLDER',
+                        help='output of mgauss motions, to say how each '
+                             'catalogue compares with the other exposures '
+                             'of its field')
     tools.add_overwrite(parser)
 
 
@@ -39,6 +43,10 @@ def run(options):
         if not sections:
             msg = f'{options.inputs[0]}: must hold results, got none'
             raise ValueError(msg)
+        if options.field is not None:
+            from photutils_mgauss.cli.field_section import field_sections
+            sections += field_sections(options.field,
+                                       [path for path, _ in paths])
         step('draw figures')
         _write(options, sections, output)
     tools.say(options, f'{output}: {len(sections)} results')

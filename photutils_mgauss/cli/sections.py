@@ -136,8 +136,8 @@ def _star_panels(table, good, seen):
     x, y = column_values(table, 'x_fit'), column_values(table, 'y_fit')
     panels = [
         Panel(lambda ax: plotting.plot_detections(
-            x, y, flux, data=seen and seen.data, ax=ax),
-            'The stars, brighter ones larger.'),
+            x, y, flux, data=seen.data if seen and seen.whole else None,
+            ax=ax), 'The stars, brighter ones larger.'),
         Panel(lambda ax: plotting.plot_stated_errors(
             magnitude[good], errors, unit='pix', label=label, ax=ax),
             'Errors of position against magnitude, of stars without flags.')]
@@ -147,11 +147,20 @@ def _star_panels(table, good, seen):
             lambda ax: _chi2(ax, magnitude[good], chi2, label),
             'How well the PSF describes the stars: 1 if noise is all that '
             'is left.'))
+    if seen is not None and not seen.whole:
+        (x0, y0), (ny, nx) = seen.corner, seen.data.shape
+        near = (x >= x0) & (x < x0 + nx) & (y >= y0) & (y < y0 + ny)
+        panels.append(Panel(
+            lambda ax: plotting.plot_detections(
+                x[near] - x0, y[near] - y0, flux[near], data=seen.data,
+                ax=ax),
+            f'The middle of the image, from pixel {x0}, {y0}.'))
     if seen is not None and seen.residual is not None:
+        what = 'the image' if seen.whole else 'the middle of the image'
         panels.append(Panel(
             lambda ax: plotting.plot_residual_image(seen.residual, seen.error,
                                                     ax=ax),
-            'What the stars leave of the image, in standard errors.'))
+            f'What the stars leave of {what}, in standard errors.'))
     return panels
 
 

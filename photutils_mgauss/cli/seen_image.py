@@ -10,8 +10,11 @@ from photutils_mgauss.cli.star_image import Reading, read_image
 from photutils_mgauss.simulation.scene import render_stars
 from photutils_mgauss.utils.star_columns import column_values
 
-# Larger images are not shown: their stars would be specks [pix].
+# Of larger images the middle is shown: stars of the whole would be specks,
+# and drawing them all takes long [pix].
 _LARGEST = 800
+# Stars so far outside the middle still have light in it [pix].
+_MARGIN = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,12 +22,16 @@ class SeenImage:
     """
     An image less its sky, (ny, nx), and what its stars leave of it.
 
-    ``residual`` and ``error`` are None where the PSF is not found.
+    ``residual`` and ``error`` are None where the PSF is not found. ``corner``
+    (x, y) is the first pixel shown of the image, and ``whole`` says whether
+    that is all of it.
     """
 
     data: np.ndarray
     residual: np.ndarray | None
     error: np.ndarray | None
+    corner: tuple
+    whole: bool
 
 
 def seen_image(path, table, record):
@@ -43,8 +50,8 @@ def seen_image(path, table, record):
     Returns
     -------
     SeenImage or None
-        None if there is no image of that name, or it is too large to be shown
-        whole.
+        None if there is no image of that name. Of a large one it is the
+        middle.
     """
     exposure = record.get('exposure', {})
     file = _found(path, exposure.get('image'))
@@ -55,20 +62,42 @@ def seen_image(path, table, record):
         warnings.simplefilter('ignore')
         try:
             image = read_image(file, Reading(ext=exposure.get('ext')))
-            data = np.where(image.mask, np.nan, image.without_sky)
-            error = image.noise.total
+            middle = _middle(image.data.shape)
+            data = np.where(image.mask, np.nan, image.without_sky)[middle]
+            error = np.broadcast_to(image.noise.total,
+                                    image.data.shape)[middle]
         except (OSError, ValueError):
             return None
-    if max(data.shape) > _LARGEST:
-        return None
+    corner = middle[1].start, middle[0].start
+    whole = data.shape == image.data.shape
     psf = _found(path, record.get('psf'))
     if psf is None:
-        return SeenImage(data, None, None)
+        return SeenImage(data, None, None, corner, whole)
+    drawn = _drawn(read_psf(psf), table, data.shape, corner)
+    return SeenImage(data, data - drawn, error, corner, whole)
+
+
+def _middle(shape):
+    """Return the slices of what is shown of an image."""
+    starts = [max(0, (n - _LARGEST) // 2) for n in shape]
+    return tuple(slice(start, min(n, start + _LARGEST))
+                 for start, n in zip(starts, shape, strict=True))
+
+
+def _drawn(psf, table, shape, corner):
+    """Return the stars of a table in the part of an image at a corner."""
     stars = np.array([column_values(table, name) for name in
                       ('x_fit', 'y_fit', 'flux_fit')])
-    drawn = render_stars(read_psf(psf), *stars[:, np.isfinite(stars).all(0)],
-                         data.shape)
-    return SeenImage(data, data - drawn, error)
+    stars[:2] -= np.reshape(corner, (2, 1))
+    size = np.reshape(shape[::-1], (2, 1))
+    near = np.isfinite(stars).all(axis=0)
+    near[near] = np.all((stars[:2, near] > -_MARGIN)
+                        & (stars[:2, near] < size + _MARGIN), axis=0)
+    if any(corner):
+        psf = type(psf)(list(psf.mixtures), psf.grid_xypos - corner,
+                        scales=psf.scales,
+                        pixel_integrated=psf.pixel_integrated)
+    return render_stars(psf, *stars[:, near], shape)
 
 
 def _found(path, name):

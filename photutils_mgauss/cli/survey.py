@@ -2,6 +2,7 @@
 import os
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 from tqdm import tqdm
@@ -11,6 +12,7 @@ from photutils_mgauss.cli import tools
 _EXAMPLE = """\
 # What mgauss survey does. Names are relative to the folder of this file.
 output = "survey"
+# pages = false            # no page of figures for each exposure
 
 [exposures]
 files = {files}
@@ -24,6 +26,7 @@ files = {files}
 [psf]
 # n_components = 6
 # degree = 3
+# start = "archive.fits"  # a PSF that the stars of each exposure change
 
 [photometry]
 # psf = "detector"        # one fit for all exposures of a detector, or
@@ -146,13 +149,11 @@ def _run(options, survey):
                else cluster_workers(options.cluster))
     mark_output(survey)
     try:
-        psfs, done, fields, pixels = _all_steps(options, survey, workers)
+        steps = _all_steps(options, survey, workers)
     finally:
         workers.close()
-    _finish(options, survey, psfs, done, fields, pixels,
-            time.perf_counter() - start)
-    if any(outcome.error for some in (psfs, done, fields, pixels)
-           for outcome in some.values()):
+    _finish(options, survey, *steps, time.perf_counter() - start)
+    if any(outcome.error for some in steps for outcome in some.values()):
         msg = (f'{survey.output / "index.html"} lists what failed; the rest '
                'is finished, and the same command tries again')
         raise RuntimeError(msg)
@@ -167,7 +168,19 @@ def _all_steps(options, survey, workers):
                  'fields')
     pixels = _do(options, tasks.pixel_tasks(survey, _good(done),
                                             _good(fields)), workers, 'pixels')
-    return psfs, done, fields, pixels
+    pages = _do(options, _pages(options, survey, _good(done), _good(fields)),
+                workers, 'pages')
+    return psfs, done, fields, pixels, pages
+
+
+def _pages(options, survey, measured, solved):
+    """Return the tasks of pages, if they can be drawn."""
+    from photutils_mgauss.cli.survey_tasks import page_tasks
+    if survey.pages and find_spec('matplotlib') is None:
+        tools.say(options, "exposures have no pages without matplotlib: "
+                  "pip install 'photutils_mgauss[plot]'")
+        return []
+    return page_tasks(survey, measured, solved)
 
 
 def _good(outcomes):
@@ -190,21 +203,21 @@ def _do(options, tasks, workers, what):
     return {task.name: done[task.name] for task in tasks}
 
 
-def _finish(options, survey, psfs, done, fields, pixels, seconds):
+def _finish(options, survey, psfs, done, fields, pixels, pages, seconds):
     """Write what people look at."""
     from photutils_mgauss.cli import survey_results as results
     from photutils_mgauss.cli.survey_tasks import motions_of
-    rows = [results.exposure_row(exposure, done[exposure.name])
-            for exposure in survey.exposures]
+    rows = results.exposure_rows(survey, done, fields, pages)
     lines = [results.field_row(name, survey.fields[
         name.removesuffix('_pixels')], outcome)
         for name, outcome in (fields | pixels).items()]
     lines += [results.field_row(name, (), outcome)
-              for name, outcome in psfs.items() if outcome.error]
-    outcomes = [*psfs.values(), *done.values(), *fields.values(),
-                *pixels.values()]
+              for name, outcome in (psfs | pages).items() if outcome.error]
+    results_of = [*psfs.values(), *done.values(), *fields.values(),
+                  *pixels.values()]
+    outcomes = [*results_of, *pages.values()]
     failed = sum(bool(one.error) for one in outcomes)
-    old = sum(one.skipped for one in outcomes)
+    old = sum(one.skipped for one in results_of)
     words = (f'{len(done)} exposures, {len(fields)} fields, {failed} failed, '
              f'{old} of an earlier run, {seconds:.0f} s')
     results.write_index(survey.output, rows, lines, words)

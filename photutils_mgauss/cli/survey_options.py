@@ -17,10 +17,12 @@ _ONE_IMAGE = ('error', 'weight', 'flags', 'wcs', 'time', 'detector', 'frames')
 # Options of mgauss motions that are for images to be measured first, which
 # here is the work of other commands.
 _MEASURING = {'psf': ('n_components', 'degree', 'radius', 'min_snr',
-                      'max_stars', 'stars'),
+                      'max_stars', 'stars', 'start'),
               'photometry': ('crowded', 'threshold', 'magnitudes', 'psf')}
 _PIXELS_ONLY = ('targets', 'forced', 'refine_frames', 'fit_shape')
 _SHARED = ('parallax', 'observer')
+# Options that name a file.
+_FILES = ('references', 'targets', 'parallax_of', 'stars')
 
 
 def check_keys(path, table, known, what):
@@ -110,7 +112,25 @@ def check_overlaps(path, text):
                'crowded stars, or takes psf = FILE; [psf] and psf = '
                '"detector" must be left out')
         raise ValueError(msg)
+    if 'start' in psf and 'n_components' in psf:
+        msg = (f'{path}: n_components of [psf] must be left out with start, '
+               'whose Gaussians are kept')
+        raise ValueError(msg)
+    if given == 'detector' and 'start' in psf:
+        msg = (f'{path}: start of [psf] must be given without psf = '
+               '"detector": it is for the PSF of each exposure')
+        raise ValueError(msg)
     _check_motions(path, text)
+
+
+def check_files(path, text, folder):
+    """Raise if an option names a file that there is none of."""
+    for name in COMMANDS:
+        for key, value in text.get(name, {}).items():
+            if key in _FILES and not (folder / str(value)).is_file():
+                msg = (f'{path}: {key} of [{name}] must be a file, got '
+                       f'{value}, which is none in {folder}')
+                raise FileNotFoundError(msg)
 
 
 def _better_place(name, key):
@@ -158,24 +178,30 @@ def motion_options(motions):
     return catalogues, pixels
 
 
-def archive_of(path, folder, given):
+def psf_files(path, folder, given, what):
     """
-    Return the PSF files that are given, by detector ('' is any), or {}.
+    Return the PSF files that are given, by detector ('' is any).
+
+    Parameters
+    ----------
+    path, folder : `~pathlib.Path`
+        The survey file, and the folder that names are relative to.
+    given : str or dict
+        A file, or one for each detector.
+    what : str
+        What must be one, for messages.
 
     Raises
     ------
     ValueError
         If one is missing or no PSF.
     """
-    if given in ('exposure', 'detector'):
-        return {}
     given = given if isinstance(given, dict) else {'': given}
     out = {}
     for detector, name in given.items():
         file = folder / str(name)
         if not file.is_file():
-            msg = (f'{path}: psf of [photometry] must be "exposure", '
-                   f'"detector" or a file, got {name}, which is none')
+            msg = f'{path}: {what}, got {name}, which is none'
             raise ValueError(msg)
         _check_psf(file)
         out[str(detector)] = str(file)

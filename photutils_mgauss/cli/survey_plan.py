@@ -8,12 +8,13 @@ from photutils_mgauss.cli.footprints import Footprint, connected, overlaps
 from photutils_mgauss.cli.survey_options import (
     COMMANDS,
     READING,
-    archive_of,
+    check_files,
     check_keys,
     check_overlaps,
     files_of,
     motion_options,
     parsed,
+    psf_files,
     words,
 )
 
@@ -56,8 +57,10 @@ class Survey:
     ``options`` has the words of each command, ``reading`` those for all,
     ``files`` the files that the words of each command name, ``psf`` is
     'exposure', 'detector' or 'archive', where ``archive`` has the files by
-    detector, ``fields`` the numbers of the exposures of each field by its
-    name, ``regions`` those of fields that hang together.
+    detector, as ``start`` those that the stars of an exposure change,
+    ``pages`` says whether exposures get pages, ``fields`` the numbers of the
+    exposures of each field by its name, ``regions`` those of fields that hang
+    together.
     """
 
     file: Path
@@ -68,6 +71,8 @@ class Survey:
     files: dict
     psf: str
     archive: dict
+    start: dict
+    pages: bool
     pixels: bool
     fields: dict
     regions: dict
@@ -102,10 +107,16 @@ def read_survey(path):
     """
     text = _toml(path)
     folder = path.resolve().parent
+    check_files(path, text, folder)
     wanted = text.get('exposures', {})
     tables = _tables(text)
     given = text.get('photometry', {}).get('psf', 'exposure')
-    archive = archive_of(path, folder, given)
+    archive = {} if given in ('exposure', 'detector') else psf_files(
+        path, folder, given, 'psf of [photometry] must be "exposure", '
+        '"detector" or a file')
+    start = text.get('psf', {}).get('start')
+    start = {} if start is None else psf_files(
+        path, folder, start, 'start of [psf] must be a file')
     options = {name: words(table, folder) for name, table in tables.items()}
     for name, some in options.items():
         parsed(path, 'motions' if name == 'pixels' else name, some)
@@ -113,7 +124,8 @@ def read_survey(path):
                      if key in READING}, folder)
     exposures = _exposures(path, folder, wanted, parsed(
         path, 'photometry', reading, 'exposures'))
-    _check_archive(path, exposures, archive)
+    _check_archive(path, exposures, archive, 'psf of [photometry]')
+    _check_archive(path, exposures, start, 'start of [psf]')
     motions = text.get('motions', {})
     fields, regions = _fields(exposures, float(wanted.get('overlap', 0.5)))
     if motions.get('pixels'):
@@ -122,7 +134,8 @@ def read_survey(path):
         path.resolve(), folder / text.get('output', 'survey'), exposures,
         options, reading, {name: files_of(table, folder)
                            for name, table in tables.items()},
-        'archive' if archive else given, archive,
+        'archive' if archive else given, archive, start,
+        bool(text.get('pages', True)),
         bool(motions.get('pixels')),
         regions if motions.get('together') else fields, regions)
 
@@ -135,7 +148,11 @@ def _toml(path):
         except tomllib.TOMLDecodeError as error:
             msg = f'{path}: must be a TOML file: {error}'
             raise ValueError(msg) from error
-    check_keys(path, text, ('output', 'exposures', *COMMANDS), 'keys')
+    check_keys(path, text, ('output', 'pages', 'exposures', *COMMANDS),
+               'keys')
+    if not isinstance(text.get('pages', True), bool):
+        msg = f'{path}: pages must be true or false, got {text["pages"]}'
+        raise TypeError(msg)
     for name in ('exposures', *COMMANDS):
         if not isinstance(text.get(name, {}), dict):
             msg = f'{path}: {name} must be a table, [{name}], got {text[name]}'
@@ -151,7 +168,10 @@ def _tables(text):
     catalogues, pixels = motion_options(text.get('motions', {}))
     photometry = {key: value for key, value in
                   text.get('photometry', {}).items() if key != 'psf'}
-    tables = {'psf': text.get('psf', {}), 'photometry': photometry,
+    # The file that PSFs start from may be another for each detector.
+    psf = {key: value for key, value in text.get('psf', {}).items()
+           if key != 'start'}
+    tables = {'psf': psf, 'photometry': photometry,
               'motions': catalogues}
     return tables | ({'pixels': pixels} if pixels.get('pixels') else {})
 
@@ -255,13 +275,13 @@ def _keyword(file, key):
     raise ValueError(msg)
 
 
-def _check_archive(path, exposures, archive):
+def _check_archive(path, exposures, archive, what):
     """Raise if there is a detector whose PSF is not given."""
     if not archive or '' in archive:
         return
     for exposure in exposures:
         if exposure.detector not in archive:
-            msg = (f'{path}: psf of [photometry] must name a file for each '
+            msg = (f'{path}: {what} must name a file for each '
                    f'detector, got none for {exposure.detector!r} of '
                    f'{exposure.path}')
             raise ValueError(msg)

@@ -1,12 +1,19 @@
 """What a survey leaves for people: an index page, and one dataset."""
 import json
 import shutil
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 
 import numpy as np
 
 from photutils_mgauss.cli import tools
+from photutils_mgauss.cli.exposure_quality import (
+    CATALOGUE,
+    FIELD,
+    FieldOfExposures,
+    judge,
+)
 from photutils_mgauss.utils.star_columns import column_values
 
 # Order of the HEALPix pixels that divide the dataset, and of its index.
@@ -24,9 +31,12 @@ body {{ font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; padding: 16px;
 table {{ border-collapse: collapse; font-size: 0.9em; }}
 th, td {{ padding: 3px 12px 3px 0; text-align: right;
          border-bottom: 1px solid #d5dde4; white-space: nowrap; }}
-th:first-child, td:first-child, td:last-child {{ text-align: left; }}
+th:first-child, td:first-child, th:last-child {{ text-align: left; }}
+td.words {{ text-align: left; white-space: normal; }}
+td.words:not(:first-child, :empty) {{ min-width: 30ch; }}
 th {{ cursor: pointer; }}
 .failed td:first-child {{ border-left: 6px solid #d55e00; padding-left: 6px; }}
+.look td:first-child {{ border-left: 6px solid #e69f00; padding-left: 6px; }}
 @media (prefers-color-scheme: dark) {{
   body {{ color: #dce4ea; background: #15191d; }} a {{ color: #7cc0ee; }}
   th, td {{ border-color: #38424b; }} }}
@@ -68,22 +78,30 @@ def write_index(folder, exposures, fields, summary):
 def _table(rows):
     if not rows:
         return '<p>none</p>'
-    rows = sorted(rows, key=lambda row: row['trouble'] == '')
+    rows = sorted(rows, key=lambda row: row['trouble'] == '')  # stable
     head = ''.join(f'<th scope="col">{escape(name)}</th>' for name in rows[0])
     body = ''.join(
-        f'<tr{" class=failed" if row["trouble"] else ""}>' + ''.join(
-            f'<td>{_cell(value)}</td>' for value in row.values()) + '</tr>'
+        f'<tr{_class(row)}>' + ''.join(
+            _cell(value) for value in row.values()) + '</tr>'
         for row in rows)
     return (f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>'
             f'{body}</tbody></table></div>')
 
 
+def _class(row):
+    if row['trouble']:
+        return ' class=failed'
+    return ' class=look' if row.get('look at') else ''
+
+
 def _cell(value):
     if isinstance(value, Path):
-        return f'<a href="{escape(value.as_posix())}">{escape(value.stem)}</a>'
+        return (f'<td><a href="{escape(value.as_posix())}">'
+                f'{escape(value.stem)}</a></td>')
     if isinstance(value, float):
-        return f'{value:.4g}' if np.isfinite(value) else ''
-    return escape(str(value))
+        return f'<td>{value:.4g}</td>' if np.isfinite(value) else '<td></td>'
+    words = ' class=words' if isinstance(value, str) else ''
+    return f'<td{words}>{escape(str(value))}</td>'
 
 
 def exposure_figures(task):
@@ -130,17 +148,57 @@ def field_figures(task):
     return row
 
 
+def field_and_exposures(task):
+    """Return the figures of a field, with those of its exposures."""
+    field = FieldOfExposures(Path(task.outputs[0]).parent)
+    return field_figures(task) | {'exposures': field.figures()}
+
+
 # What is looked at when a task of a kind is done.
-FIGURES = {'exposure': exposure_figures, 'field': field_figures}
-_EXPOSURE = ('FWHM [pix]', 'ellipticity', 'stars', 'without flags',
-             'reduced chi2', 'x_err of bright stars [pix]')
+FIGURES = {'exposure': exposure_figures, 'field': field_and_exposures,
+           'pixels': field_figures}
 _FIELD = ('stars', 'with motions', 'median pmra_error [mas / yr]')
 
 
-def exposure_row(exposure, outcome):
-    """Return the row of an exposure, its figures of merit included."""
-    return {'exposure': exposure.name, 'year': round(exposure.year, 4),
-            **_figures(outcome, _EXPOSURE)}
+def exposure_rows(survey, done, fields, pages):
+    """
+    Return the rows of all exposures, the worst first.
+
+    Parameters
+    ----------
+    survey : Survey
+        The plan.
+    done, fields, pages : dict of str to Outcome
+        What became of exposures, fields and pages.
+
+    Returns
+    -------
+    list of dict
+        One for each exposure: its figures of merit, among the others of its
+        field and of its camera, and what is bad about it.
+    """
+    within = {name: figures for outcome in fields.values()
+              for name, figures in outcome.figures.get('exposures',
+                                                       {}).items()}
+    outcomes = [done[one.name] for one in survey.exposures]
+    figures = [outcome.figures | within.get(outcome.name, {})
+               for outcome in outcomes]
+    judged = judge(figures, [one.camera for one in survey.exposures])
+    rows = [{'exposure': _link(outcome.name, pages),
+             'year': round(exposure.year, 4),
+             **_figures(replace(outcome, figures=some), CATALOGUE | FIELD,
+                        look_at=words)}
+            for exposure, outcome, some, (words, _) in zip(
+                survey.exposures, outcomes, figures, judged, strict=True)]
+    far = [how_far for _, how_far in judged]
+    order = sorted(range(len(rows)), key=lambda k: -far[k])
+    return [rows[k] for k in order]
+
+
+def _link(name, pages):
+    page = pages.get(f'{name}_page')
+    return name if page is None or page.error else Path(
+        'pages') / f'{name}.html'
 
 
 def field_row(name, members, outcome):
@@ -149,8 +207,9 @@ def field_row(name, members, outcome):
             **_figures(outcome, _FIELD)}
 
 
-def _figures(outcome, names):
+def _figures(outcome, names, **more):
     return {**{name: outcome.figures.get(name, np.nan) for name in names},
+            **{name.replace('_', ' '): words for name, words in more.items()},
             'trouble': outcome.error or '; '.join(outcome.notes)}
 
 

@@ -1,4 +1,6 @@
 """The tasks of a survey: words of commands, and the files they concern."""
+from functools import cache
+
 from photutils_mgauss.cli import tools
 from photutils_mgauss.cli.survey_run import Task
 
@@ -14,8 +16,7 @@ def catalogue_of(survey, exposure):
 def psf_of(survey, exposure):
     """Return the file of an exposure's PSF, or None if it has none."""
     if survey.psf == 'archive':
-        archive = survey.archive
-        return archive.get(exposure.detector, archive.get(''))
+        return _for_detector(survey.archive, exposure)
     if '--crowded' in survey.options['photometry']:
         return None
     folder = survey.output / 'psfs'
@@ -23,6 +24,16 @@ def psf_of(survey, exposure):
         return str(folder / exposure.camera
                    / f'{tools.stem(exposure.path)}_psf.fits')
     return str(folder / f'{exposure.name}.fits')
+
+
+def _for_detector(files, exposure):
+    """Return the file of an exposure's detector, or that of any, or None."""
+    return files.get(exposure.detector, files.get(''))
+
+
+def page_of(survey, name):
+    """Return the file of an exposure's page."""
+    return survey.output / 'pages' / f'{name}.html'
 
 
 def _record(survey, name):
@@ -73,10 +84,12 @@ def _exposure_task(survey, exposure):
     inputs = [image, *survey.files['photometry']]
     outputs, commands = [catalogue], []
     if survey.psf == 'exposure' and psf is not None:
-        commands.append(('psf', image, *_TO, psf,
+        start = _for_detector(survey.start, exposure)
+        known = () if start is None else ('--start', start)
+        commands.append(('psf', image, *_TO, psf, *known,
                          *_reading(survey, exposure, times=False),
                          *survey.options['psf']))
-        inputs += survey.files['psf']
+        inputs += (*survey.files['psf'], *known[1:])
         outputs.append(psf)
     elif psf is not None:
         inputs.append(psf)
@@ -155,7 +168,57 @@ def _pixel_task(survey, name, members):
              *_reading(survey, members[0]), *survey.options['pixels'])
     return Task(f'{name}_pixels', (words,),
                 (*images, *psfs, *frames, *survey.files['pixels']),
-                (str(table),), _record(survey, f'{name}_pixels'), 'field')
+                (str(table),), _record(survey, f'{name}_pixels'), 'pixels')
+
+
+def page_tasks(survey, measured, solved):
+    """
+    Return the task of each exposure's page, if there are to be any.
+
+    Parameters
+    ----------
+    survey : Survey
+        The plan.
+    measured, solved : set of str
+        The exposures that have a catalogue, and the fields that have
+        motions.
+
+    Returns
+    -------
+    list of Task
+    """
+    if not survey.pages:
+        return []
+    field_of = {i: name for name, members in survey.fields.items()
+                for i in members if name in solved}
+    is_grid = cache(_is_grid)
+    return [_page_task(survey, exposure, field_of.get(i), is_grid)
+            for i, exposure in enumerate(survey.exposures)
+            if exposure.name in measured]
+
+
+def _is_grid(psf):
+    """Whether a file has a PSF that need not be fitted to be shown."""
+    from photutils_mgauss.cli.psf_files import psf_kind
+    return psf_kind(psf) == 'mixtures'
+
+
+def _page_task(survey, exposure, field, is_grid):
+    psf, page = psf_of(survey, exposure), page_of(survey, exposure.name)
+    files = [str(catalogue_of(survey, exposure))]
+    if psf is not None and (survey.psf != 'archive' or is_grid(psf)):
+        files.insert(0, psf)
+    inputs, among = list(files), ()
+    if field is not None:
+        folder = motions_of(survey, field).parent
+        inputs += [str(folder / f'{name}.ecsv')
+                   for name in ('motions', 'residuals', 'alignment')]
+        among = ('--field', str(folder))
+    words = ('report', *files, *among, '--title', exposure.name, *_TO,
+             str(page))
+    name = f'{exposure.name}_page'
+    return Task(name, (words,), tuple(inputs), (str(page),),
+                _record(survey, name))
 
 
 def _frame(survey, name, exposure):

@@ -138,6 +138,7 @@ def assemble(epochs, references, how, transform):
         detections, on_sky.all(), catalogue, how, unit, orient)
     years = (every.years[:, 0] if every.years.shape[1] == 1
              else np.nanmean(every.years, axis=1))
+    del detections, orient  # as large as all that was measured
     if references is None:
         known = np.empty(0, dtype=int)
     elif catalogue is None:

@@ -187,7 +187,7 @@ def _resolve(matrices, rhs, weights):
 def _mean_motion(fit, basis):
     """Return what the maps (q,) add to the mean motion, (2, q)."""
     others = np.flatnonzero(~fit.setup.anchors)
-    stars = others if len(others) else np.arange(fit.problem.n_stars)
+    stars = others if len(others) else np.arange(fit.n_stars)
     stars = stars[:: max(1, len(stars) // SAMPLE)]
     some = eliminate(fit.problem.select(stars))
     moved = np.einsum('kin,knq->inq', some.factor, scaled_rows(some, basis))

@@ -236,19 +236,24 @@ class Estimates:
     total: np.ndarray | None = None
 
 
-def solve_stars(problem, correction, factor, *, residuals=False,
+def solve_stars(problem, correction, inverse, *, residuals=False,
                 leverage=False, judge=False):
-    """Return the `Estimates` of a part of the stars; see `solve_all`."""
+    """
+    Return the `Estimates` of a part of the stars; see `solve_all`.
+
+    ``inverse`` (M, M) is the covariance of the correction.
+    """
     stars = eliminate(problem)
-    scaled = scaled_rows(stars, factor)
+    framed = _framed(stars, inverse)
+    middle = _middle(stars, framed)
     shift = _shift(stars.basis, correction)
-    values, covariance = _estimate(stars, shift, scaled)
+    values, covariance = _estimate(stars, shift, middle)
     away = predicted = None
     judged = None, None, None
     if residuals or judge:
         away = _residuals(problem.offsets + shift, stars, values)
     if leverage or judge:
-        predicted = _predicted(stars, problem, factor, scaled)
+        predicted = _predicted(stars, problem, inverse, framed, middle)
     if judge:
         judged = _judge(away, predicted, problem.weights)
     found = Estimates(values, covariance, away if residuals else None,
@@ -290,13 +295,32 @@ def _times(column, value):
     return 0.0 if column is None else column * value
 
 
-def _estimate(stars, shift, scaled):
+def _framed(stars, inverse):
+    """Return Z S^-1 A^T, which covariances are made of, (p, 2, E, n)."""
+    n_epochs, n_stars = stars.coupling.shape[2:]
+    out = np.empty_like(stars.coupling)
+    for k, row in enumerate(out):
+        moved = (inverse @ stars.rows(k)).reshape(
+            n_epochs, 2, len(stars.basis), n_stars)
+        np.einsum('ecbn,bn->cen', moved, stars.basis, out=row)
+    return out
+
+
+def _middle(stars, framed):
+    """Return Z S^-1 Z^T, (p, p, n)."""
+    size = len(framed)
+    out = np.empty((size, size, framed.shape[3]))
+    for k in range(size):
+        for j in range(k + 1):
+            out[k, j] = out[j, k] = np.einsum('cen,cen->n', framed[k],
+                                              stars.coupling[j])
+    return out
+
+
+def _estimate(stars, shift, middle):
     inner = stars.y + np.einsum('kcen,cen->kn', stars.coupling, shift)
     values = apply_transposed(stars.factor, inner)
-    covariance = gram(stars.factor)
-    if scaled.shape[2]:
-        middle = np.einsum('knq,jnq->kjn', scaled, scaled)
-        covariance += gram(stars.factor, middle)
+    covariance = gram(stars.factor) + gram(stars.factor, middle)
     values[:, ~stars.solved] = np.nan
     covariance[..., ~stars.solved] = np.nan
     return values, covariance
@@ -313,27 +337,28 @@ def scaled_rows(stars, factor):
                      for k in range(len(stars.factor))])
 
 
-def _predicted(stars, problem, factor, scaled):
+def _predicted(stars, problem, inverse, framed, middle):
     r"""
     Return the covariance of the fitted positions, (3, E, n).
 
-    With :math:`U = D R^T Z - A` it is :math:`D H^{-1} D^T + U S^{-1} U^T`.
+    With :math:`P = R D^T` and :math:`F = Z S^{-1} A^T` it is
+    :math:`D H^{-1} D^T + (P^T Z - A) S^{-1} (P^T Z - A)^T =
+    P^T (1 + Z S^{-1} Z^T) P - P^T F - F^T P + A S^{-1} A^T`.
     """
-    n_epochs = problem.n_epochs
+    n_epochs, size = problem.n_epochs, len(stars.basis)
     out = np.empty((3, *problem.offsets.shape[1:]))
-    blocks = factor.reshape(n_epochs, 2, len(stars.basis), factor.shape[1])
+    blocks = inverse.reshape(n_epochs, 2, size, n_epochs, 2, size)
     for e in range(n_epochs):
         rows = [_project(stars, e, c) for c in range(2)]
-        frame = [np.einsum('kn,knq->nq', rows[c], scaled)
-                 - stars.basis.T @ blocks[e, c] for c in range(2)]
-        out[:, e] = (_products(*rows, 'kn,kn->n')
-                     + _products(*frame, 'nq,nq->n'))
+        # (1 + Z S^-1 Z^T) P - 2 F, whose product with P is made symmetric.
+        halves = [row + np.einsum('jn,jkn->kn', row, middle)
+                  - 2 * framed[:, c, e] for c, row in enumerate(rows)]
+        for k, (c, d) in enumerate(((0, 0), (0, 1), (1, 1))):
+            known = blocks[e, c, :, e, d] @ stars.basis
+            out[k, e] = ((rows[c] * halves[d]).sum(axis=0)
+                         + (rows[d] * halves[c]).sum(axis=0)) / 2 + (
+                             stars.basis * known).sum(axis=0)
     return out
-
-
-def _products(x, y, contraction):
-    return np.stack([np.einsum(contraction, a, b)
-                     for a, b in ((x, x), (x, y), (y, y))])
 
 
 def _project(stars, e, c):
@@ -345,7 +370,8 @@ def _project(stars, e, c):
     return out
 
 
-def solve_all(problem, correction, factor, executor=None, **wanted):
+def solve_all(problem, correction, factor, executor=None, *, only=None,
+              **wanted):
     """
     Return the `Estimates` of all stars of a problem with the frames found.
 
@@ -357,37 +383,43 @@ def solve_all(problem, correction, factor, executor=None, **wanted):
     factor : (M, q) `~numpy.ndarray`
         The covariance of r is ``factor @ factor.T``.
     executor : `~concurrent.futures.Executor`, optional
+    only : sequence of str, optional
+        The fields of `Estimates` that are kept, where not all are needed.
     **wanted
         ``residuals``, ``leverage`` and ``judge``: whether to return the
         residuals, what the fit took away of their covariance, and what the
         detections are judged by.
     """
-    solve = partial(solve_stars, correction=correction, factor=factor,
-                    **wanted)
+    solve = partial(solve_stars, correction=correction,
+                    inverse=factor @ factor.T, **wanted)
     whole, start = None, 0
     # Parts go as they come, or all arrays would be there twice.
     for part in each_part(solve, problem, executor):
         if whole is None:
-            whole = _for_all(part, problem.n_stars)
+            whole = _for_all(part, problem.n_stars, only)
         stop = start + part.values.shape[1]
         for name, array in whole.items():
             array[..., start:stop] = getattr(part, name)
         start = stop
-    return Estimates(**whole)
+    return Estimates(**dict.fromkeys(('values', 'covariance')) | whole)
 
 
-def _for_all(part, n):
+def _for_all(part, n, only):
     """Return arrays for n stars, of the kinds that a part has."""
-    arrays = {field.name: getattr(part, field.name) for field in fields(part)}
+    arrays = {field.name: getattr(part, field.name) for field in fields(part)
+              if only is None or field.name in only}
     return {name: np.empty((*array.shape[:-1], n), array.dtype)
             for name, array in arrays.items() if array is not None}
 
 
 def total_chi2(problem, estimates):
     """Return the chi-square (n,) of detections and what was known before."""
-    x, y = estimates.residuals
-    xx, xy, yy = problem.weights
-    chi2 = np.sum(xx * x * x + 2 * xy * x * y + yy * y * y, axis=0)
+    chi2 = np.zeros(problem.n_stars)
+    # Epoch by epoch: products of all are as large as what was measured.
+    for (x, y), (xx, xy, yy) in zip(
+            estimates.residuals.swapaxes(0, 1),
+            problem.weights.swapaxes(0, 1), strict=True):
+        chi2 += xx * x * x + 2 * xy * x * y + yy * y * y
     priors = problem.priors
     chi2[priors.stars] += priors.chi2(estimates.values)
     return chi2

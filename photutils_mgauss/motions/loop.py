@@ -1,5 +1,6 @@
 """The loop behind `ProperMotionFitter`: solve, judge, reject, and again."""
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from astropy.table import QTable
@@ -52,10 +53,15 @@ class Fit:
     ----------
     setup : `~photutils_mgauss.motions.prepare.Setup`
     state : `State`
-    problem : `~photutils_mgauss.motions.problem.MotionProblem`
+    pose_again : callable
+        Returns the `~photutils_mgauss.motions.problem.MotionProblem` that
+        was solved: as large as all that was measured, it is made whenever it
+        is asked for.
     frames : `~photutils_mgauss.motions.frames.Frames`
     estimates : `~photutils_mgauss.motions.joint.Estimates`
-        With residuals.
+        Without residuals.
+    rms : (E, 2) `~numpy.ndarray`
+        Of the residuals of the references, NaN where there are none.
     chi2 : (n,) `~numpy.ndarray`
         Of the detections of each star and of what was known of it.
     ranks : (n,) int `~numpy.ndarray`
@@ -67,30 +73,66 @@ class Fit:
 
     setup: Setup
     state: State
-    problem: MotionProblem
+    pose_again: object
     frames: Frames
     estimates: Estimates
+    rms: np.ndarray
     chi2: np.ndarray
     ranks: np.ndarray
     leak: tuple | None
 
     @property
+    def problem(self):
+        """The `~photutils_mgauss.motions.problem.MotionProblem` solved."""
+        return self.pose_again()
+
+    @property
+    def n_parameters(self):
+        """Number of parameters of a star."""
+        return self.setup.options.n_star_parameters
+
+    @property
+    def n_stars(self):
+        """Number of stars."""
+        return self.setup.origin.shape[1]
+
+    @property
     def dof(self):
         """Measured and known numbers of each star less parameters, (n,)."""
-        each = dimensions_2x2(self.setup.sightings.covariance)
-        return ((each * self.state.used).sum(axis=0) + self.ranks
-                - self.problem.n_parameters)
+        count = self.ranks - self.n_parameters
+        covariance = self.setup.sightings.covariance
+        for e, used in enumerate(self.state.used):
+            count = count + dimensions_2x2(covariance[:, e]) * used
+        return count
 
 
-def finished(setup, state, problem, frames, estimates):
+def finished(setup, state, problem, frames, estimates, pose_again):
     """Return the `Fit` with these estimates of its stars."""
     chi2 = total_chi2(problem, estimates)
     observer, leak = setup.sightings.observer, None
     if observer is not None and not setup.options.parallax:
         leak = parallax_leak(replace(problem, observer=observer),
                              setup.options.executor)
-    return Fit(setup, state, problem, frames, estimates, chi2, problem.ranks,
+    rms = _reference_rms(setup, state, estimates.residuals)
+    return Fit(setup, state, pose_again, frames,
+               replace(estimates, residuals=None), rms, chi2, problem.ranks,
                leak)
+
+
+def references_in_use(setup, state):
+    """Return which stars (n,) say where the frames are."""
+    stars = setup.anchors.copy()
+    stars[state.dropped] = False
+    return stars
+
+
+def _reference_rms(setup, state, residuals):
+    """Return the rms (E, 2) of the residuals of references."""
+    used = state.used & references_in_use(setup, state)
+    used &= np.isfinite(residuals).all(axis=0)
+    return np.array([
+        np.sqrt(np.mean(residuals[:, e, own]**2, axis=1))
+        if own.any() else [np.nan, np.nan] for e, own in enumerate(used)])
 
 
 def pose(setup, state):
@@ -177,7 +219,7 @@ def _align(setup, state):
         # In units of a typical error.
         size = np.abs(frames.correction).sum(axis=2).max(initial=0) / typical
         turned = np.abs(after.swerve - state.swerve).max(initial=0) / typical
-        state = after
+        state = replace(after, posed=replace(state, posed=None))
         if size < CONVERGED and turned < CONVERGED:
             break
         if i > 5 and not size < before:
@@ -207,7 +249,8 @@ def fit(setup, state):
         estimates, common = remove_mean_fields(problem, frames, estimates,
                                                setup.options)
         state = replace(state, maps=state.maps - common)
-    return finished(setup, state, problem, frames, estimates)
+    return finished(setup, state, problem, frames, estimates,
+                    partial(pose, setup, state.posed))
 
 
 def _with_terms(setup, state):
@@ -255,7 +298,7 @@ def measured_alone(result):
     problem = result.problem.unbound
     estimates = solve(result.setup, problem, result.frames, residuals=True)
     return finished(result.setup, result.state, problem, result.frames,
-                    estimates)
+                    estimates, lambda: result.problem.unbound)
 
 
 def solve(setup, problem, frames, **wanted):
@@ -276,7 +319,8 @@ def _review(setup, state, problem, frames):
     if len(dropped):
         return replace(state, dropped=np.union1d(state.dropped,
                                                  dropped)), True
-    estimates = solve(setup, problem, frames, judge=True)
+    estimates = solve(setup, problem, frames, judge=True,
+                      only=('chi2', 'raw'))
     each = _measured_numbers(problem)
     bad = worst_outliers(estimates.chi2, state.used,
                          _spare(problem, each) & ~state.crooked,

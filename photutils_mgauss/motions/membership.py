@@ -135,9 +135,10 @@ def mean_motion(fit, stars, parameters):
 def _frame_share(fit, stars):
     """Return the factor (k, 2, q) of what frames add to motions."""
     parts, plane = [], fit.setup.sightings.plane
+    problem = fit.problem
     for start in range(0, len(stars), CHUNK):
         some = stars[start:start + CHUNK]
-        left = eliminate(fit.problem.select(some))
+        left = eliminate(problem.select(some))
         share = np.einsum('kin,knq->niq', left.factor,
                           scaled_rows(left, fit.frames.factor))
         if plane is not None:

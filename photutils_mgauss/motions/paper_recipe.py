@@ -15,6 +15,7 @@ straight line is fitted to each coordinate of each star (Eq. 11) with errors
 error of the mean displacement.
 """
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -89,14 +90,19 @@ def fit_paper(setup, state):
     maps[..., 0] += shift.T
     errors = frame_error(found, dt, setup.options.eps_t)
     state = replace(state, maps=maps, floor=errors.T**2)
-    problem = pose(setup, state)
-    # Eq. 11 takes each coordinate by itself.
-    weights = problem.weights.copy()
-    weights[1] = 0.0
-    problem = replace(problem, weights=weights)
+    problem = _pose(setup, state)
     empty = np.zeros((maps.size, 0))
     notes = (POSITIONS, MOTIONS.format(field=''))
     frames = Frames(np.zeros_like(maps), empty,
                     notes if setup.relative else notes[:1])
     estimates = solve(setup, problem, frames, residuals=True)
-    return finished(setup, state, problem, frames, estimates)
+    return finished(setup, state, problem, frames, estimates,
+                    partial(_pose, setup, state))
+
+
+def _pose(setup, state):
+    problem = pose(setup, state)
+    # Eq. 11 takes each coordinate by itself.
+    weights = problem.weights.copy()
+    weights[1] = 0.0
+    return replace(problem, weights=weights)

@@ -143,7 +143,8 @@ class State:
     left, ``distortion`` (C, 2, b) the polynomials of chips [pix], if any,
     ``scales`` the `~photutils_mgauss.motions.error_scale.ErrorScales` of the
     epochs, ``factor`` (E, n) what they multiply covariances by and ``added``
-    (E, n) the variances they add, if they are fitted.
+    (E, n) the variances they add, if they are fitted. ``posed`` is the state
+    that the last problem was posed in, whose frames led to this one.
     """
 
     maps: np.ndarray
@@ -158,6 +159,7 @@ class State:
     scales: ErrorScales | None = None
     factor: np.ndarray | None = None
     added: np.ndarray | None = None
+    posed: 'State | None' = None
 
 
 def prepare(sightings, options):

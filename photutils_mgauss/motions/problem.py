@@ -31,6 +31,8 @@ class MotionProblem:
     acceleration : bool
     ties : (n,) bool `~numpy.ndarray`
         The stars that take part in finding the frames.
+    jerk : bool, optional
+        Whether accelerations change; only with ``acceleration``.
     """
 
     offsets: np.ndarray
@@ -43,11 +45,13 @@ class MotionProblem:
     priors: Priors
     acceleration: bool
     ties: np.ndarray
+    jerk: bool = False
 
     @property
     def n_parameters(self):
         """Number of parameters of a star."""
-        return 4 + (self.observer is not None) + 2 * self.acceleration
+        return (4 + (self.observer is not None) + 2 * self.acceleration
+                + 2 * self.jerk)
 
     @property
     def n_stars(self):
@@ -109,6 +113,9 @@ class MotionProblem:
         if self.acceleration:
             half = self.dt**2 / 2
             columns += [(half, None), (None, half)]
+        if self.jerk:
+            sixth = self.dt**3 / 6
+            columns += [(sixth, None), (None, sixth)]
         return columns
 
 

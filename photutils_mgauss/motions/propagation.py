@@ -44,7 +44,7 @@ def at_epoch(fit, year, stars):
     moved = move @ values
     half = np.tensordot(move, covariance, axes=1)
     spread = np.einsum('ijn,kj->ikn', half, move)
-    numbers = np.arange(fit.problem.n_stars)[stars]
+    numbers = np.arange(fit.n_stars)[stars]
     near = np.flatnonzero(np.isin(numbers, fit.setup.nearing.stars))
     if near.size:
         swerve, change = _in_space(fit, year, numbers[near])
@@ -61,7 +61,7 @@ def at_epoch(fit, year, stars):
 def _straight(fit, year):
     """Return the matrix from parameters at the working epoch to a year."""
     dt = year - fit.setup.working_year
-    move = np.eye(fit.problem.n_parameters)
+    move = np.eye(fit.n_parameters)
     move[0, 2] = move[1, 3] = dt
     if fit.setup.options.acceleration:
         move[0, -2] = move[1, -1] = dt**2 / 2

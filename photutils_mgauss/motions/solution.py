@@ -10,6 +10,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss.motions.bootstrap import bootstrap_frames
 from photutils_mgauss.motions.corrected_epochs import correct_epochs
+from photutils_mgauss.motions.curvature import curvature_table
 from photutils_mgauss.motions.detectors import detector_residuals
 from photutils_mgauss.motions.doubts import doubts, remarks
 from photutils_mgauss.motions.loop import (
@@ -73,9 +74,8 @@ def solution_of(result, ref_epoch=None):
     fit's own.
     """
     year = result.setup.working_year if ref_epoch is None else ref_epoch
-    parameters = propagated(result, year)
     corrected, residuals = correct_epochs(result)
-    stars = star_table(result, year, parameters)
+    stars = _stars_at(result, year)
     alignment = alignment_table(result, residuals)
     doubtful = doubts(result)
     for sentence in doubtful:
@@ -308,6 +308,50 @@ class MotionSolution:
         """
         n_field = as_integer(n_field, 'n_field', minimum=1)
         return membership_table(self.stars, n_field)
+
+    def accelerations(self):
+        """
+        Test whether stars move straight.
+
+        In the frames found, from the detections in use alone, an
+        acceleration is fitted to each star, and then a jerk beside it. A
+        detection that was rejected as an outlier does not count, though it
+        may be what bends the motion: see ``clip`` of the fitter.
+
+        Returns
+        -------
+        `~astropy.table.QTable`
+            ``id``, in the order of ``stars``; ``accra``, ``accdec``, their
+            errors and ``acc_significance``, fitted without a jerk;
+            ``jerkra``, ``jerkdec``, their errors and ``jerk_significance``.
+            A significance is the length of the vector in its errors; without
+            any acceleration it exceeds 3 for one star in 90. NaN where there
+            are too few detections.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from astropy.table import Table
+        >>> from photutils_mgauss import Epoch, ProperMotionFitter
+        >>> rng = np.random.default_rng(1)
+        >>> place = rng.uniform(0, 900, (2, 40))
+        >>> epochs = []
+        >>> for year in range(2018, 2025):
+        ...     x, y = place + rng.normal(0, 0.01, (2, 40))
+        ...     x[7] += 0.02 * (year - 2021)**2 / 2
+        ...     epochs.append(Epoch(Table({
+        ...         'id': np.arange(40), 'x_fit': x, 'y_fit': y,
+        ...         'x_err': np.full(40, 0.01), 'y_err': np.full(40, 0.01)}),
+        ...         time=year))
+        >>> fitter = ProperMotionFitter(references=range(20, 40), clip=None)
+        >>> table = fitter.fit(epochs).accelerations()
+        >>> bent = table[np.argmax(table['acc_significance'])]
+        >>> print(bent['id'], bent['accra'].round(3))
+        7 0.021 pix / yr2
+        >>> bool(bent['jerk_significance'] < 3)
+        True
+        """
+        return curvature_table(self._fit, self.stars['id'])
 
     def _check_absolute(self, purpose):
         if self._fit.setup.relative:

@@ -6,7 +6,7 @@ from scipy.special import chdtri
 
 from photutils_mgauss.motions.baseline import period
 from photutils_mgauss.motions.joint import solve_all
-from photutils_mgauss.motions.loop import measured
+from photutils_mgauss.motions.loop import measured, references_in_use
 from photutils_mgauss.motions.membership import fit_groups
 from photutils_mgauss.motions.propagation import FROM_OURS
 from photutils_mgauss.motions.stacked import invert_2x2
@@ -146,6 +146,7 @@ def star_table(fit, ref_year, parameters):
     flags, solved = _flags(fit)
     table = QTable({'id': sightings.names})
     _add_parameters(table, fit, parameters, solved)
+    del parameters  # as large as the table
     table['ref_epoch'] = np.full(len(table), ref_year) * u.yr
     _add_quality(table, fit, solved)
     if fit.leak is not None:
@@ -449,23 +450,11 @@ def _counts(fit):
     """Return the references used and rejected, and their rms, by name."""
     setup, state = fit.setup, fit.state
     sightings = setup.sightings
-    stars = setup.anchors.copy()
-    stars[state.dropped] = False
-    used = state.used & stars
+    used = state.used & references_in_use(setup, state)
     lost = sightings.usable & ~state.used & setup.anchors
-    lost |= sightings.usable & np.isin(np.arange(len(stars)), state.dropped)
-    rms = [_rms(fit.estimates.residuals[:, e, used[e]])
-           for e in range(len(used))]
+    lost |= sightings.usable & np.isin(np.arange(used.shape[1]), state.dropped)
     return {'n_references': used.sum(axis=1), 'n_rejected': lost.sum(axis=1),
-            'rms': rms * u.Unit(sightings.unit)}
-
-
-def _rms(residuals):
-    """Return the rms (2,) of residuals (2, k), NaN if there are none."""
-    known = residuals[:, np.isfinite(residuals).all(axis=0)]
-    if not known.size:
-        return [np.nan, np.nan]
-    return np.sqrt(np.mean(known**2, axis=1))
+            'rms': fit.rms * u.Unit(sightings.unit)}
 
 
 def residual_table(fit):

@@ -25,6 +25,9 @@ def tie_planes(detections, years, catalogue, stars, on_sky, transform):
     """
     Return positions and covariances on the common plane, and the `Ties`.
 
+    Those of planes without a sky are changed where they are, as a copy of
+    all that was measured would be the largest of all arrays.
+
     The common plane is the catalogue's, or that of the epochs with a sky, or
     the first epoch's.
 
@@ -45,7 +48,6 @@ def tie_planes(detections, years, catalogue, stars, on_sky, transform):
     agreed = np.ones(places.shape[2], dtype=bool)
     if on_sky.all() or transform.kind == 'none':
         return places, covariance, Ties(maps, agreed)
-    places, covariance = places.copy(), covariance.copy()
     targets = np.full(places[:, 0].shape, np.nan)
     targets[:, stars] = catalogue.values[:2]
     known = np.isfinite(targets[0]).sum() >= 3

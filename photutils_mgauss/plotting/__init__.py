@@ -47,6 +47,7 @@ from photutils_mgauss.plotting.stars import (
     plot_comparison,
     plot_detections,
     plot_error_curve,
+    plot_pulls,
     plot_residual_image,
     plot_stated_errors,
 )
@@ -71,6 +72,7 @@ __all__ = [
     'plot_projection',
     'plot_proper_motions',
     'plot_psf_image',
+    'plot_pulls',
     'plot_radial_profile',
     'plot_reference_differences',
     'plot_residual',

@@ -15,9 +15,54 @@ __all__ = [
     'plot_comparison',
     'plot_detections',
     'plot_error_curve',
+    'plot_pulls',
     'plot_residual_image',
     'plot_stated_errors',
 ]
+
+# Larger pulls are counted at the ends.
+_MOST_PULL = 5.0
+
+def plot_pulls(pulls, *, ax=None):
+    """
+    Show how numbers in their errors are distributed.
+
+    Parameters
+    ----------
+    pulls : (n,) array_like
+        Differences divided by their errors; NaN is left out.
+    ax : `~matplotlib.axes.Axes`, optional
+        Where to draw; None is pyplot's current Axes.
+
+    Returns
+    -------
+    `~matplotlib.axes.Axes`
+        Its Axes, with the normal distribution that right errors would give.
+        Those beyond five errors are counted at the ends.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from matplotlib.figure import Figure
+    >>> from photutils_mgauss import plotting
+    >>> pulls = np.random.default_rng(1).normal(0, 1, 500)
+    >>> ax = plotting.plot_pulls(pulls, ax=Figure().add_subplot())
+    >>> ax.get_xlabel(), ax.get_legend_handles_labels()[1]
+    ('residual / error', ['500, rms 0.98', 'right errors'])
+    """
+    ax = current_axes(ax)
+    pulls = np.asarray(pulls, float)
+    pulls = pulls[np.isfinite(pulls)]
+    edges = np.linspace(-_MOST_PULL, _MOST_PULL, 41)
+    rms = np.sqrt(np.mean(pulls**2)) if pulls.size else np.nan
+    ax.hist(np.clip(pulls, -_MOST_PULL, _MOST_PULL), edges, color=BLUE,
+            alpha=0.6, label=f'{len(pulls)}, rms {rms:.2f}')
+    x = np.linspace(-_MOST_PULL, _MOST_PULL, 201)
+    ax.plot(x, len(pulls) * (edges[1] - edges[0]) * np.exp(-x**2 / 2)
+            / np.sqrt(2 * np.pi), color=BLACK, label='right errors')
+    ax.set(xlabel='residual / error', ylabel='number')
+    ax.legend()
+    return ax
 
 
 def plot_detections(x, y, flux, *, data=None, ax=None):

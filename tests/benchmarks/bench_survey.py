@@ -1,8 +1,13 @@
 """
 Exposures a minute of ``mgauss survey``, and what the machinery costs.
 
-Parts, with ``--parts``, all by default:
+Parts, with ``--parts``, all but ``whole`` by default:
 
+``whole``   one run from images to motions by two workers, of 40 fields of 5
+            epochs of two detectors, 200 exposures, with PSFs of three
+            Gaussians and degree 2: exposures a minute, where the time goes,
+            the driver's memory, what is lost. ``--pages`` draws the page of
+            each exposure, too.
 ``speed``   the survey of simulated exposures, each a process of its own, by
             one worker on one core and by two on two: exposures a minute, the
             efficiency of two, the processor's time of workers and driver,
@@ -14,7 +19,8 @@ Parts, with ``--parts``, all by default:
             are measured: what is lost, and what is done twice.
 
 Run: ``python tests/benchmarks/bench_survey.py [--fields 8] [--epochs 2]``;
-``--fields 40 --epochs 5`` for 200 exposures.
+``--parts whole --fields 40 --epochs 5`` for 200 exposures end to end,
+``--parts memory --tiny 200`` for the memory of 200 and of 400.
 """
 import argparse
 import json
@@ -30,7 +36,7 @@ from pathlib import Path
 import astropy.units as u
 import numpy as np
 from astropy.io import fits
-from astropy.table import QTable
+from astropy.table import QTable, vstack
 from astropy.wcs import WCS
 
 from photutils_mgauss import (
@@ -45,14 +51,21 @@ from photutils_mgauss.cli import main, survey_run
 from photutils_mgauss.cli.survey_plan import read_survey
 from photutils_mgauss.cli.survey_tasks import exposure_tasks
 
-PARTS = ('speed', 'task', 'memory', 'kills')
+PARTS = ('speed', 'task', 'memory', 'kills', 'whole')
+NO_PAGES = 'pages = false\n'
+QUICK = '[psf]\nn_components = 3\ndegree = 2\n'
 TABLES = ('catalogues', 'motions', 'motions_hats/dataset', 'wcs')
 
 
 # Images.
 
 def write_images(folder, n_fields, n_epochs, size):
-    """Write the exposures of fields that lie apart, and their quasars."""
+    """
+    Write the exposures of fields that lie apart, and all quasars.
+
+    Fields are taken by two detectors in turn.
+    """
+    quasars = []
     for k in range(n_fields):
         ra, dec = 192.8595, 27.0 + 0.1 * k
         sources = sky_field(120, 60, ra=ra, dec=dec, size=size * 0.074 / 60,
@@ -64,7 +77,13 @@ def write_images(folder, n_fields, n_epochs, size):
                                  instrument=Instrument(shape=(size, size)),
                                  rng=k)
         for number, scene in enumerate(scenes):
-            scene.write(folder / f'field{k:02d}_{number}.fits')
+            path = folder / f'field{k:02d}_{number}.fits'
+            scene.write(path)
+            fits.setval(path, 'DETECTOR', value=f'CCD{k % 2 + 1}')
+        quasars.append(sources[sources['kind'] == 'qso']['ra', 'dec'])
+    known = vstack(quasars)
+    known['class'] = 'qso'
+    known.write(folder.parent / 'quasars.ecsv')
 
 
 def write_tiny(folder, n, size=64, stars=9):
@@ -94,12 +113,18 @@ def write_tiny(folder, n, size=64, stars=9):
 
 # Runs.
 
-def survey_file(folder, name, text=''):
+def survey_file(folder, name, text='', top=''):
     """Write a survey file; return its name."""
     path = folder / f'{name}.toml'
-    path.write_text(f'output = "{name}"\n[exposures]\n'
-                    f'files = ["raw/*.fits"]\n{text}')
+    path.write_text(f'output = "{name}"\n{top}[exposures]\n'
+                    f'files = ["raw/*.fits"]\n{text}', encoding='utf-8')
     return path
+
+
+def tiny_survey(folder):
+    """Return the survey of tiny exposures, of which no pages are drawn."""
+    return survey_file(folder, 'out', '[photometry]\npsf = "psf.fits"\n',
+                       NO_PAGES)
 
 
 def run_survey(path, workers, cores):
@@ -169,11 +194,11 @@ def speed(folder, options):
     (folder / 'raw').mkdir()
     write_images(folder / 'raw', options.fields, options.epochs, options.size)
     n = options.fields * options.epochs
-    warm = survey_file(folder, 'warm')
+    warm = survey_file(folder, 'warm', top=NO_PAGES)
     warm.write_text(warm.read_text().replace('raw/*', 'raw/field00*'))
     run_survey(warm, 2, 2)
-    took = {k: run_survey(survey_file(folder, f'with{k}'), k, k)
-            for k in (1, 2)}
+    took = {k: run_survey(survey_file(folder, f'with{k}', top=NO_PAGES), k,
+                          k) for k in (1, 2)}
     for k, one in took.items():
         cpu = one['driver'] + one['workers']
         print(f'{n} exposures of {options.size}^2, {k} worker(s) on {k} '
@@ -206,6 +231,39 @@ def sum_of(took):
     return took['driver'] + took['workers']
 
 
+def whole(folder, options):
+    """Print what a survey takes from images to motions."""
+    (folder / 'raw').mkdir()
+    start = time.perf_counter()
+    write_images(folder / 'raw', options.fields, options.epochs, options.size)
+    n = options.fields * options.epochs
+    print(f'{n} exposures are simulated in {time.perf_counter() - start:.0f}'
+          ' s', flush=True)
+    path = survey_file(
+        folder, 'out', f'detector = "DETECTOR"\n{QUICK}[motions]\n'
+        'references = "quasars.ecsv"\n', '' if options.pages else NO_PAGES)
+    took = run_survey(path, 2, 2)
+    print(f'{n} exposures of {options.size}^2 by 2 workers on 2 cores: '
+          f'{took["seconds"]:.0f} s, {60 * n / took["seconds"]:.2f} a '
+          f'minute; driver {took["driver"]:.1f} CPU s and '
+          f'{took["memory"]:.1f} MB, workers {took["workers"]:.0f} CPU s')
+    records = [json.loads(one.read_text()) for one in (
+        folder / 'out' / 'records').glob('*.json')]
+    kinds = {'exposures': [one for one in records
+                           if 'FWHM [pix]' in one['figures']],
+             'fields': [one for one in records
+                        if 'exposures' in one['figures']],
+             'pages': [one for one in records
+                       if one['name'].endswith('_page')]}
+    for what, some in kinds.items():
+        print(f'{len(some)} {what}: '
+              f'{sum(one["cpu"] for one in some):.0f} CPU s')
+    stars = sum(one['figures']['with motions'] for one in kinds['fields'])
+    print(f'{stars} stars with motions; '
+          f'{size_of(folder / "out") / n / 1e6:.2f} MB an exposure are '
+          'written')
+
+
 def one_task(folder, _):
     """Print what a task costs that does nothing."""
     n = 200
@@ -233,8 +291,7 @@ def memory(folder, options):
         place = folder / str(n)
         place.mkdir()
         write_tiny(place, n)
-        path = survey_file(place, 'out', '[photometry]\npsf = "psf.fits"\n')
-        took = run_survey(path, 2, 2)
+        took = run_survey(tiny_survey(place), 2, 2)
         found[n] = took['memory']
         print(f'{n} tiny exposures: driver {took["memory"]:.1f} MB, '
               f'{took["driver"]:.1f} CPU s; workers '
@@ -246,7 +303,7 @@ def memory(folder, options):
 def kills(folder, options):
     """Print what is lost and done twice when processes are killed."""
     write_tiny(folder, options.tiny)
-    path = survey_file(folder, 'out', '[photometry]\npsf = "psf.fits"\n')
+    path = tiny_survey(folder)
     rng = np.random.default_rng(options.seed)
     wanted = ['worker'] * 20 + ['driver'] * 5
     rng.shuffle(wanted)
@@ -298,7 +355,7 @@ def noted(task):
 def run(options):
     """Measure, and print."""
     functions = {'speed': speed, 'task': one_task, 'memory': memory,
-                 'kills': kills}
+                 'kills': kills, 'whole': whole}
     for part in options.parts.split(','):
         with tempfile.TemporaryDirectory() as name:
             functions[part](Path(name), options)
@@ -306,12 +363,13 @@ def run(options):
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--parts', default=','.join(PARTS))
+    parser.add_argument('--parts', default=','.join(PARTS[:-1]))
     parser.add_argument('--fields', type=int, default=8)
     parser.add_argument('--epochs', type=int, default=2)
     parser.add_argument('--size', type=int, default=512)
     parser.add_argument('--tiny', type=int, default=200)
     parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--pages', action='store_true')
     parser.add_argument('--drive', nargs=2)
     parser.add_argument('--noted')
     arguments = parser.parse_args()

@@ -115,6 +115,16 @@ def test_a_survey_ends_in_motions_and_runs_only_what_changed(survey, capsys):
     page = (folder / 'index.html').read_text()
     assert page.count('<tr') == 2 + 5 + 2
     assert page.index('>noise<') < page.index('>north0<')
+    for words in ('completeness', 'pulls of references', 'systematic error',
+                  'FWHM [pix]', 'href="pages/north0.html"'):
+        assert words in page
+    assert 'href="pages/noise.html"' not in page
+    own = (folder / 'pages' / 'north0.html').read_text()
+    # Its image and what is left of it, its PSF, its pulls.
+    for words in ('What the stars leave of the image', 'The PSF in the middle',
+                  'north0 in its field', 'in their errors, along both axes'):
+        assert words in own
+    assert own.count('<h2>north0 in its field') == 1
     # Nothing changed, so nothing is done again but what failed.
     before = stamps(folder)
     assert '1 failed, 6 of an earlier run' in run(survey, capsys)

@@ -18,6 +18,7 @@ from photutils_mgauss.cli.survey_tasks import (
     detector_tasks,
     exposure_tasks,
     field_tasks,
+    page_tasks,
     pixel_tasks,
 )
 
@@ -54,9 +55,10 @@ def folder(tmp_path):
     return tmp_path
 
 
-def plan(folder, text, exposures=''):
+def plan(folder, text, exposures='', top=''):
     path = folder / 'survey.toml'
-    path.write_text(f'[exposures]\nfiles = "raw/*.fits"\n{exposures}\n{text}')
+    path.write_text(f'{top}[exposures]\nfiles = "raw/*.fits"\n{exposures}\n'
+                    f'{text}')
     return read_survey(path)
 
 
@@ -80,10 +82,56 @@ BY_DETECTOR = 'detector = "DETECTOR"'
     ('[motions]\npixels = true\nplane = true', 'without plane'),
     ('[motions]\nrefine_frames = true', 'must be given with pixels'),
     ('[photometry]\npsf = "none.fits"', 'got none.fits, which is none'),
+    ('[psf]\nstart = "none.fits"', r'start of \[psf\] must be a file, got'),
+    ('[psf]\nstart = "raw/e0.fits"', 'must be a PSF, but is an image'),
+    ('[psf]\nstart = "psf.fits"\nn_components = 3',
+     'must be left out with start'),
+    ('[psf]\nstart = "psf.fits"\n[photometry]\npsf = "detector"',
+     'must be given without psf = "detector"'),
+    ('[motions]\nstart = "psf.fits"', r'start .* must be in \[psf\]'),
     ('[photometry]\npsf = "raw/e0.fits"', 'must be a PSF, but is an image')])
 def test_options_that_overlap_are_named(folder, text, said):
     with pytest.raises(ValueError, match=said):
         plan(folder, text)
+
+
+@pytest.mark.parametrize('text', [
+    '[motions]\nreferences = "gaia.ecsv"',
+    '[motions]\npixels = true\ntargets = "gaia.ecsv"',
+    '[psf]\nstars = "gaia.ecsv"'])
+def test_a_file_that_there_is_none_of_is_named(folder, text):
+    with pytest.raises(FileNotFoundError, match='must be a file, got gaia'):
+        plan(folder, text)
+
+
+def test_a_psf_to_start_from_is_that_of_the_detector(folder):
+    survey = plan(folder, '[psf]\ndegree = 0\nstart = {7 = "psf.fits", 8 = '
+                  '"psf.fits"}', BY_DETECTOR)
+    task = exposure_tasks(survey)[1]
+    psf, photometry = task.commands
+    assert psf[psf.index('--start') + 1] == str(folder / 'psf.fits')
+    assert '--start' not in photometry
+    # A new PSF of that name is a reason to make others of it.
+    assert str(folder / 'psf.fits') in task.inputs
+    with pytest.raises(ValueError, match=r"start of \[psf\] must name a file "
+                                         r"for each detector.*'8' of"):
+        plan(folder, '[psf]\nstart = {7 = "psf.fits"}', BY_DETECTOR)
+
+
+def test_each_measured_exposure_has_a_page(folder):
+    survey = plan(folder, '[photometry]\npsf = "psf.fits"')
+    tasks = page_tasks(survey, {'e0', 'e2'}, {'field0001'})
+    assert [task.name for task in tasks] == ['e0_page', 'e2_page']
+    words, = tasks[0].commands
+    assert '--field' in words
+    assert any(name.endswith('residuals.ecsv') for name in tasks[0].inputs)
+    # One without motions shows what there is.
+    words, = page_tasks(survey, {'e0'}, set())[0].commands
+    assert '--field' not in words
+    assert not page_tasks(plan(folder, '', top='pages = false\n'), {'e0'},
+                          set())
+    with pytest.raises(TypeError, match='pages must be true or false, got 3'):
+        plan(folder, '', top='pages = 3\n')
 
 
 def test_a_table_that_is_none_is_named(folder):

@@ -119,3 +119,16 @@ def test_a_residual_image_is_in_standard_errors(ax):
     residual = np.arange(12.0).reshape(3, 4)
     plotting.plot_residual_image(residual, np.full((3, 4), 2.0), ax=ax)
     assert_allclose(ax.images[0].get_array(), residual / 2)
+
+
+def test_pulls_are_counted_beside_those_of_right_errors(ax, rng):
+    pulls = np.append(2 * rng.standard_normal(2000), [40.0, np.nan])
+    plotting.plot_pulls(pulls, ax=ax)
+    counts = np.array([bar.get_height() for bar in ax.patches])
+    # Those far off are at the end, not lost.
+    assert counts.sum() == 2001
+    width = ax.patches[0].get_width()
+    y = ax.lines[0].get_ydata()
+    assert_allclose(y.max(), 2001 * width / np.sqrt(2 * np.pi))
+    right = ax.get_legend_handles_labels()[1]
+    assert right[0].startswith('2001, rms 2.')
