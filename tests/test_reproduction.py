@@ -190,3 +190,26 @@ def test_positions_keep_all_their_digits_until_they_are_summed_up(store,
     run.table('one', lambda: table_of(place), keep=False)
     again = run.table('one', lambda: table_of(0.0), keep=False)
     assert again['value'][0] == place
+
+
+@pytest.mark.usefixtures('store')
+def test_images_that_went_through_files_are_the_same_but_for_rounding():
+    from scenes import through_files
+
+    from photutils_mgauss import (
+        DetectorEffects,
+        Instrument,
+        simulate,
+        sparse_field,
+    )
+    scene = simulate(sparse_field((90, 80), rng=1), rng=2,
+                     effects=DetectorEffects.typical(),
+                     instrument=Instrument(shape=(90, 80)))
+    read = through_files(scene)
+    assert scene.mask.any()
+    np.testing.assert_array_equal(read.mask, scene.mask)
+    np.testing.assert_allclose(read.image, scene.image, rtol=1e-5)
+    good = ~scene.mask
+    np.testing.assert_allclose(read.error[good], scene.error[good],
+                               rtol=1e-5)
+    assert np.isfinite(read.error).all()

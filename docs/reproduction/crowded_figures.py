@@ -11,7 +11,14 @@ from peers import (
     sextractor,
     windowed,
 )
-from scenes import background_free, cubic, detector, find_stars, robust_fit
+from scenes import (
+    background_free,
+    cubic,
+    detector,
+    find_stars,
+    robust_fit,
+    through_files,
+)
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 from settings import PIXEL, effects
@@ -48,7 +55,7 @@ def scene_of(run):
                      Exposure(band='g', detector=8), psf=one.light,
                      instrument=Instrument(shape=shape), effects=effects(),
                      rng=42 + seed)
-    return one, scene
+    return one, through_files(scene)
 
 
 def measure(run):

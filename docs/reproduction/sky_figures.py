@@ -5,7 +5,7 @@ import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
-from scenes import catalogue, detector
+from scenes import catalogue, detector, through_files
 from settings import CAMPAIGNS, PIXEL, effects
 from store import Comparison, Figure, Group, binned, spread
 from styles import COLOURS, MARKS, canvas_colours, canvas_of
@@ -85,10 +85,10 @@ def _scene(run, number):
         _scenes.clear()
         exposure, size = exposures(run)[number], run.settings.sky_size
         one = detector(run, exposure.detector, size)
-        _scenes[key] = simulate(
+        _scenes[key] = through_files(simulate(
             sources(run), exposure, psf=one.light, effects=effects(),
             rng=300 + number + 1000 * run.seed,
-            instrument=Instrument(shape=(size, size)))
+            instrument=Instrument(shape=(size, size))))
     return _scenes[key]
 
 
