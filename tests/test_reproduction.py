@@ -213,3 +213,37 @@ def test_images_that_went_through_files_are_the_same_but_for_rounding():
     np.testing.assert_allclose(read.error[good], scene.error[good],
                                rtol=1e-5)
     assert np.isfinite(read.error).all()
+
+
+@pytest.mark.usefixtures('store')
+def test_a_program_that_is_not_there_is_said_to_be_absent(monkeypatch):
+    from daophot import daophot
+    from peers import AbsentError
+    monkeypatch.setenv('PATH', '')
+    with pytest.raises(AbsentError, match='apt-get install iraf-noao'):
+        daophot(None, None, None, 1)
+
+
+@pytest.mark.usefixtures('store')
+def test_daophot_finds_the_stars_where_they_are(monkeypatch):
+    from daophot import daophot
+    from peers import AbsentError, program
+    try:
+        program('DAOPHOT', 'irafcl')
+    except AbsentError as error:
+        pytest.skip(str(error))
+    from photutils_mgauss import Instrument, simulate, sparse_field
+    scene = simulate(sparse_field((300, 310), spacing=40, rng=1), rng=2,
+                     instrument=Instrument(shape=(300, 310)))
+    true = scene.truth[scene.truth['inside']]
+    true = true[np.argsort(true['mag'])]
+    bright = QTable({'x': true['x'].value[:20], 'y': true['y'].value[:20]})
+    found = daophot(scene, scene, bright, 0)
+    away = np.hypot(
+        *(found[c][:, None] - bright[c] for c in 'xy')).min(axis=0)
+    # Convention of the first pixel, and the scale of the fluxes.
+    assert np.median(away) < 0.05
+    nearest = np.hypot(*(found[c][:, None] - bright[c]
+                         for c in 'xy')).argmin(axis=0)
+    ratio = found['flux'][nearest] / true['flux'].value[:20]
+    assert abs(np.median(ratio) - 1) < 0.3

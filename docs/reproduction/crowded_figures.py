@@ -3,6 +3,8 @@ from functools import partial
 
 import numpy as np
 from astropy.table import QTable, Table
+from daophot import daophot
+from matplotlib.patches import Rectangle
 from peers import (
     INSTALL,
     AbsentError,
@@ -23,7 +25,7 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 from settings import PIXEL, effects
 from store import Comparison, Figure, Group, binned, judged, plain
-from styles import COLOURS, MARKS, canvas_of
+from styles import COLOURS, canvas_of, plain_log
 
 from photutils_mgauss import (
     CrowdedMixturePhotometry,
@@ -44,6 +46,14 @@ WINDOWS = (3, 5, 7, 11)
 WINDOW = 7
 SEXTRACTOR = ('SExtractor IMAGE', 'SExtractor WIN', 'SExtractor PSF')
 MAS = 1000 * PIXEL
+# How each method looks: colour, mark and line. Ours are thick, the modes of
+# SExtractor have one colour.
+LOOKS = {
+    'SExtractor IMAGE': ('#E69F00', 'v:'), 'SExtractor WIN': ('#E69F00', '^-'),
+    'SExtractor PSF': ('#E69F00', 's--'), 'sep windowed': ('#999999', '^:'),
+    'photutils, empirical PSF': ('#999999', 's-'), PAPER: ('#0072B2', 's-'),
+    'crowded, K = 3': ('#0072B2', 'o--'), OURS: ('#D55E00', 'o-'),
+    'crowdsource': ('#009E73', 'D-'), 'DAOPHOT': ('#CC79A7', 'P-')}
 
 
 def scene_of(run):
@@ -184,6 +194,13 @@ def with_crowdsource(crowd):
                        crowd.one.models['field'])
 
 
+def with_daophot(crowd):
+    """Return DAOPHOT's own list, with a PSF of its own."""
+    stars = crowd.one.psf_stars
+    return daophot(crowd.scene, crowd.one.sparse, stars[stars['selected']],
+                   crowd.run.settings.degree)
+
+
 def left_out(name, crowd):
     """Say that a program is not run."""
     msg = f'this command does not run it ({INSTALL[name]})'
@@ -210,7 +227,7 @@ METHODS = {
     'crowded, K = 3': partial(together, 'paper'),
     OURS: partial(together, 'field'),
     'crowdsource': with_crowdsource,
-    'DAOPHOT': partial(left_out, 'DAOPHOT'),
+    'DAOPHOT': with_daophot,
     'DOLPHOT': partial(left_out, 'DOLPHOT'),
 }
 
@@ -368,6 +385,8 @@ def draw_field(tables):
         shown = ax.imshow(image, origin='lower', cmap='cividis', vmin=-0.5,
                           vmax=7)
         ax.set(xlabel='x [pix]', ylabel='y [pix]')
+    middle.add_patch(Rectangle((-0.5, -0.5), part, part, fill=False,
+                               edgecolor='white', linewidth=1.2))
     canvas.colorbar(shown, ax=right, label='arcsinh(electrons / 10)')
     return canvas
 
@@ -387,19 +406,19 @@ def draw_errors(tables):
     table = tables['errors']
     canvas = canvas_of(3.9)
     left, right = canvas.subplots(1, 2)
-    names = list(dict.fromkeys(table['method']))
-    for k, name in enumerate(names):
+    for name in dict.fromkeys(table['method']):
         part = table[table['method'] == name]
-        style = {'color': COLOURS[k % len(COLOURS)], 'label': name,
-                 'linewidth': 2 if name in (OURS, PAPER) else 0.7,
-                 'zorder': 3 if name in (OURS, PAPER) else 2}
-        mark = f'{MARKS[k % len(MARKS)]}-'
+        colour, mark = LOOKS[name]
+        own = name in (OURS, PAPER)
+        style = {'color': colour, 'label': name, 'zorder': 3 if own else 2,
+                 'linewidth': 2.2 if own else 0.8,
+                 'markerfacecolor': colour if own else 'white'}
         left.plot(part['mag'], part['median_error'], mark, **style)
         right.plot(part['mag'], 100 * part['completeness'], mark, **style)
     left.plot(part['mag'], part['bound'], 'k:',
               label='bound of a lone star')
-    left.set(yscale='log', xlabel='g [mag]',
-             ylabel='median error of position [mas]')
+    left.set(xlabel='g [mag]', ylabel='median error of position [mas]')
+    plain_log(left)
     right.set(xlabel='g [mag]', ylabel='stars found [%]')
     canvas.legend(*left.get_legend_handles_labels(), ncols=4,
                   loc='outside lower center')
@@ -421,7 +440,7 @@ def compare_errors(tables):
                     & np.isfinite(here['median_error'].value)]
         if len(some):
             lines += _lines(middle, here, some, full)
-    return lines + _window_lines(tables['windows'], full)
+    return lines + _window_lines(tables['windows'])
 
 
 def _lines(middle, here, some, full):
@@ -442,7 +461,7 @@ def _line(middle, name, ours, best, method, full):
         judged(ours < best, '', method=method, full=full))
 
 
-def _window_lines(table, full):
+def _window_lines(table):
     """Compare windows with the modes of SExtractor, on common stars."""
     lines = []
     for middle in np.unique(table['mag'].value):
@@ -451,15 +470,19 @@ def _window_lines(table, full):
             continue
         modes = here['median_common'][here['window'].value == 0].value
         mine = here[here['method'] == 'K = 3']
+        values = mine['median_common'].value
         best = np.nanmin(modes) if len(modes) else np.nan
-        words = ' / '.join(f'{v:.2f}' for v in mine['median_common'].value)
+        words = ' / '.join(f'{v:.2f}' for v in values)
+        sides = [str(side) for side, value in zip(WINDOWS, values,
+                                                  strict=True) if value < best]
         lines.append(Comparison(
             f'{middle:.1f} mag, stars common to all: star by star, K = 3, in '
             f'{" / ".join(map(str, WINDOWS))} pixels; best mode of '
             'SExtractor', 'smaller than SExtractor' if middle > 21 else
-            'SExtractor WIN similar', f'{words}; {best:.2f} mas',
-            judged(np.nanmin(mine['median_common'].value) < best, '',
-                   method=True, full=full)))
+            'SExtractor WIN similar',
+            f'{words}; {best:.2f} mas ({mine["number_common"][0]} stars)',
+            f'better in windows of {", ".join(sides)} pixels' if sides
+            else 'worse in all windows'))
     return lines
 
 
