@@ -146,7 +146,7 @@ def test_the_page_puts_the_second_seed_beside_the_first(store):
 @pytest.mark.usefixtures('store')
 def test_sources_are_the_same_only_where_they_are_close_both_ways():
     from astropy.coordinates import SkyCoord
-    from sky_figures import _same
+    from sky_measures import _same
     true = SkyCoord([10.0, 10.001], [0.0, 0.0], unit='deg')
     found = SkyCoord(10 + np.array([0.04, 0.1, 3.0, 3.7]) / 3600,
                      np.zeros(4), unit='deg')
