@@ -247,3 +247,34 @@ def test_daophot_finds_the_stars_where_they_are(monkeypatch):
                          for c in 'xy')).argmin(axis=0)
     ratio = found['flux'][nearest] / true['flux'].value[:20]
     assert abs(np.median(ratio) - 1) < 0.3
+
+
+@pytest.mark.usefixtures('store')
+@pytest.mark.parametrize(('ours', 'again', 'spread'), [
+    ('0.86 mas', '0.76 mas', '0.07'),
+    ('-0.0010 +- 0.0325', '+0.0010 +- 0.0325', '0.0014, 0.0000'),
+    ('1.31 / 2.21; 2.10 mas (35 stars)', '1.31 / 2.21; 2.10 mas (9 stars)',
+     ''),
+    ('5.0', '5.0, 6.0', '')])
+def test_the_spread_is_what_two_values_say_of_the_scatter(ours, again,
+                                                          spread):
+    from summary import spread_of
+    assert spread_of(ours, again) == spread
+
+
+@pytest.mark.usefixtures('store')
+def test_the_page_says_what_each_seed_costs_and_which_code_ran(store,
+                                                               tmp_path):
+    import summary
+    from settings import QUICK
+    runs = [store.Run(QUICK, 'mixtures', tmp_path / f'{seed}', seed=seed)
+            for seed in range(2)]
+    for run in runs:
+        with run.step('sky'):
+            run.table('one', lambda: table_of(sum(range(100_000))))
+    summary.write(runs[0], [], [], 'COMMAND', [(runs[1], {})])
+    page = (runs[0].folder / 'summary.rst').read_text()
+    for words in ('Wall, seed 0 [s]', 'CPU, seed 1 [s]', 'COMMAND',
+                  store.versions()['photutils_mgauss'],
+                  store.provenance()['date'], 'drawn and measured twice'):
+        assert words in ' '.join(page.split())
