@@ -278,3 +278,11 @@ def test_the_page_says_what_each_seed_costs_and_which_code_ran(store,
                   store.versions()['photutils_mgauss'],
                   store.provenance()['date'], 'drawn and measured twice'):
         assert words in ' '.join(page.split())
+
+
+@pytest.mark.usefixtures('store')
+def test_dates_alone_say_how_little_more_observations_help():
+    from sky_figures import dates_alone
+    # Two dates that are 3.607 years apart.
+    assert dates_alone((0, 6)) == pytest.approx(np.sqrt(2) / 3.607, rel=1e-3)
+    assert dates_alone(range(7)) == pytest.approx(0.355, abs=0.001)

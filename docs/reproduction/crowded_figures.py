@@ -440,7 +440,26 @@ def compare_errors(tables):
                     & np.isfinite(here['median_error'].value)]
         if len(some):
             lines += _lines(middle, here, some, full)
-    return lines + _window_lines(tables['windows'])
+    return (lines + _window_lines(tables['windows'])
+            + _program_lines(table))
+
+
+def _program_lines(table):
+    """Return what programs that find stars themselves reach, and we."""
+    names = [name for name in (OURS, 'crowded, K = 3', 'DAOPHOT',
+                               'crowdsource') if name in table['method']]
+    lines = []
+    for middle in np.unique(table['mag'].value):
+        rows = [table[(table['mag'].value == middle)
+                      & (table['method'] == name)][0] for name in names]
+        if np.isfinite(rows[0]['median_error'].value):
+            lines.append(Comparison(
+                f'{middle:.1f} mag, each on the stars it finds: '
+                f'{"; ".join(names)} (complete to)', 'not compared',
+                '; '.join(f'{row["median_error"].value:.2f} '
+                          f'({row["completeness"]:.0%})'.replace('%', ' %')
+                          for row in rows) + ' mas'))
+    return lines
 
 
 def _lines(middle, here, some, full):

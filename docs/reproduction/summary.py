@@ -8,8 +8,8 @@ from settings import FULL
 from store import PACKAGES
 
 _HEAD = """\
-The paper reproduced: results
-=============================
+{title}
+{rule}
 
 .. This page is written by docs/reproduction/reproduce.py.
 
@@ -70,8 +70,9 @@ def _head(run, missing, command, others):
              'The brighter-fatter effect is off, because GalSim is not '
              'installed.')
     notes = [note for one in (run, *others) for note in one.stored()]
+    title = f'The paper reproduced: results, size {run.settings.name}'
     return _HEAD.format(
-        date=_values(notes, 'date'), command=command,
+        title=title, rule='=' * len(title), date=_values(notes, 'date'), command=command,
         versions=_filled(_versions(run, notes)), sizes=_filled(_sizes(run)),
         skipped=_skipped(run, missing), seeds=seeds, repel=repel,
         costs=_costs(run, others))
