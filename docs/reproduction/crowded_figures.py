@@ -1,6 +1,7 @@
 """A field as dense as the bulge: Figs. 13 and 14."""
 from functools import partial
 
+import astropy.units as u
 import numpy as np
 from astropy.table import QTable, Table
 from daophot import daophot
@@ -85,7 +86,8 @@ def measure(run):
                 lambda method=method: QTable(method(crowd())), keep=False)
         except AbsentError as error:
             run.skipped.setdefault(name, str(error))
-    return {'run': run, 'crowd': crowd, 'errors': run.table(
+    return {'run': run, 'crowd': crowd, 'counts': run.table(
+        'fig13_counts', lambda: _counts(crowd().scene)), 'errors': run.table(
         'fig14_errors', lambda: _errors(crowd(), lists)),
         'windows': run.table('fig14_windows',
                              lambda: _windows(crowd(), lists))}
@@ -232,6 +234,14 @@ METHODS = {
 }
 
 
+def _counts(scene):
+    """Return how many stars of each magnitude are on the image."""
+    mag = scene.truth['mag'].value[scene.truth['inside']]
+    edges = np.arange(16, 26.1, 0.25)
+    return QTable({'mag_low': edges[:-1] * u.mag,
+                   'stars': np.histogram(mag, edges)[0]})
+
+
 # Errors
 
 def _windows(crowd, lists):
@@ -372,12 +382,12 @@ def _bound(crowd, truth):
 
 def draw_field(tables):
     """Draw Fig. 13: magnitudes, the image, a part of it."""
-    scene = tables['crowd']().scene
+    scene, counts = tables['crowd']().scene, tables['counts']
     canvas = canvas_of(2.5)
     left, middle, right = canvas.subplots(1, 3)
-    mag = scene.truth['mag'].value[scene.truth['inside']]
-    left.hist(mag, np.arange(16, 26.1, 0.25), histtype='stepfilled',
-              color=COLOURS[0])
+    low = counts['mag_low'].value
+    left.stairs(counts['stars'], [*low, low[-1] + 0.25], fill=True,
+                color=COLOURS[0])
     left.set(yscale='log', xlabel='g [mag]', ylabel='stars per 0.25 mag')
     stretched = np.arcsinh((scene.image - scene.background) / 10)
     part = min(200, len(stretched) // 2)
@@ -393,12 +403,11 @@ def draw_field(tables):
 
 def compare_field(tables):
     """Compare the density."""
-    scene = tables['crowd']().scene
-    count = int(np.sum(scene.truth['inside']))
+    side, count = (tables['run'].settings.crowded_size,
+                   int(np.sum(tables['counts']['stars'])))
     return [Comparison('stars per pixel', f'{5.4e6 / (9216 * 9232):.4f}',
-                       f'{count / scene.image.size:.4f}'),
-            Comparison('pixels', '9216 x 9232',
-                       ' x '.join(map(str, scene.image.shape)))]
+                       f'{count / side**2:.4f}'),
+            Comparison('pixels', '9216 x 9232', f'{side} x {side}')]
 
 
 def draw_errors(tables):

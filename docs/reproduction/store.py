@@ -98,7 +98,8 @@ class Run:
 
     def stored(self):
         """Return what is written above each table of these settings."""
-        found = [QTable.read(path).meta for kind in ('tables', 'partial')
+        found = [_notes(path, path.stat().st_mtime_ns)
+                 for kind in ('tables', 'partial')
                  for path in sorted((self.folder / kind).glob('*.ecsv'))]
         return [one for one in found
                 if one.get('settings') == self.fingerprint]
@@ -115,6 +116,12 @@ class Run:
             wall, cpu = found.get(one['step'], (0.0, 0.0))
             found[one['step']] = wall + one['wall'], cpu + one['cpu']
         return found
+
+
+@cache
+def _notes(path, _changed):
+    """Return what is written above a table, read once while it is as it is."""
+    return QTable.read(path).meta
 
 
 def _cpu_seconds():

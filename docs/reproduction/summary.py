@@ -72,10 +72,10 @@ def _head(run, missing, command, others):
     notes = [note for one in (run, *others) for note in one.stored()]
     title = f'The paper reproduced: results, size {run.settings.name}'
     return _HEAD.format(
-        title=title, rule='=' * len(title), date=_values(notes, 'date'), command=command,
-        versions=_filled(_versions(run, notes)), sizes=_filled(_sizes(run)),
-        skipped=_skipped(run, missing), seeds=seeds, repel=repel,
-        costs=_costs(run, others))
+        title=title, rule='=' * len(title), date=_values(notes, 'date'),
+        command=command, versions=_filled(_versions(run, notes)),
+        sizes=_filled(_sizes(run)), skipped=_skipped(run, missing),
+        seeds=seeds, repel=repel, costs=_costs(run, others))
 
 
 def _values(notes, name):
@@ -184,7 +184,7 @@ def _section(run, figure, lines, others, command):
 # Figures that share tables: how the names of these begin.
 _SHARED = {'fig2': 'fig1_', 'fig4': 'fig4_', 'fig5': 'fig4_',
            'fig6': 'fig4_', 'fig7': 'fig4_', 'fig9': 'fig9_',
-           'fig10': 'fig9_', 'fig13': 'none'}
+           'fig10': 'fig9_'}
 
 
 def _prefix(key):
