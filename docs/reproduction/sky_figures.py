@@ -191,10 +191,11 @@ def compare_medians(tables):
                     why=_WHY_MOTION, method=recipe == 'paper, as printed')
                 lines += [replace(stated, verdict=(
                     f'{stated.verdict}; errors scatter by {row["pull"]:.2f} '
-                    'times what is stated')), Comparison(f'{what}, scatter about the truth; over the '
-                               'stated error', 'not given',
-                               f'{row["scatter"].value:.2f} mas/yr; '
-                               f'{row["pull"]:.2f}')]
+                    'times what is stated')), Comparison(
+                        f'{what}, scatter about the truth; over the stated '
+                        'error', 'not given',
+                        f'{row["scatter"].value:.2f} mas/yr; '
+                        f'{row["pull"]:.2f}')]
     return lines + _magnitude_lines(tables['by_magnitude'])
 
 
