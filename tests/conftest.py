@@ -1,5 +1,7 @@
 """Fixtures shared by all tests: real data that may be absent, and seeds."""
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,13 @@ threadpool_limits(1, user_api='blas')
 REALDATA = Path(os.environ.get(
     'MGAUSS_REALDATA',
     Path(__file__).resolve().parents[2] / 'shared' / 'realdata'))
+
+
+def pytest_sessionstart(session):
+    """Compile before processes share the tests: each would, all the same."""
+    if getattr(session.config.option, 'numprocesses', None):
+        subprocess.run([sys.executable, '-m', 'photutils_mgauss', 'compile',
+                        '--quiet'], check=True)
 
 
 @pytest.fixture

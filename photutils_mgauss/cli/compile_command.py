@@ -1,8 +1,12 @@
 """``mgauss compile``: every compiled function, made before it is needed."""
 import time
 import warnings
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import cache
+from multiprocessing import get_context
 
 from photutils_mgauss.cli import tools
+from photutils_mgauss.utils.parallel import available_cores
 
 
 def add(commands):
@@ -17,26 +21,51 @@ def add(commands):
 
 def run(options):
     """Compile everything and say what was done."""
-    from photutils_mgauss.kernels import jit
-
-    total = 0.0
-    for words, call in examples():
-        start = time.perf_counter()
-        with warnings.catch_warnings():
-            warnings.simplefilter('ignore')
-            call()
-        seconds = time.perf_counter() - start
-        total += seconds
+    start = time.perf_counter()
+    ready, kept = set(), None
+    for words, seconds, names, folder in compile_all():
+        ready.update(names)
+        kept = folder
         tools.say(options, f'{words:40} {seconds:6.1f} s')
-    ready = [name for name, one in jit.KERNELS.items() if one.signatures]
-    where = jit.folder()
+    total = time.perf_counter() - start
     tools.say(options, f'{len(ready)} functions ready in {total:.1f} s, '
-              + (f'kept in {where}' if where else 'not kept: no folder for '
+              + (f'kept in {kept}' if kept else 'not kept: no folder for '
                  'them can be written, see NUMBA_CACHE_DIR'))
 
 
+def compile_all():
+    """
+    Compile all examples, one on each core; yield as they are through.
+
+    A compiler works on one core, so that each takes a process. What is
+    yielded is the example's words, its seconds, the names of the functions
+    that its process has ready, and the folder of their code or None.
+    """
+    names = list(examples())
+    workers = min(available_cores(), len(names))
+    if workers == 1:
+        yield from map(_compile, names)
+        return
+    with ProcessPoolExecutor(workers, get_context('spawn')) as pool:
+        for task in as_completed([pool.submit(_compile, words)
+                                  for words in names]):
+            yield task.result()
+
+
+def _compile(words):
+    from photutils_mgauss.kernels import jit
+
+    start = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        examples()[words]()
+    ready = [name for name, one in jit.KERNELS.items() if one.signatures]
+    return words, time.perf_counter() - start, ready, jit.folder()
+
+
+@cache
 def examples():
-    """Yield (words, call) for calls that need all kernels between them."""
+    """Return {words: call} of calls that need all kernels between them."""
     import photutils_mgauss as package
 
     psf, data, error, stars = _scene(package)
@@ -44,27 +73,30 @@ def examples():
     integrated, matched = (package.GriddedMixturePSF(
         psf.mixtures, psf.grid_xypos, pixel_integrated=True,
         interpolation=how) for how in ('blend', 'components'))
-    yield 'photometry', lambda: [
-        package.MixturePSFPhotometry(one, (5, 5), aperture_radius=3)(
-            data, error=error, init_params=stars, mask=error < 0)
-        for one in (psf, integrated)]
-    yield 'photometry of several images', lambda: _fit_many(
-        package, (psf, integrated), data, error)
-    yield 'models and errors', lambda: _use_models(package, psf, matched,
-                                                   data, error)
-    yield 'mixtures of PSF images', lambda: [
-        package.fit_mixture(stamp, 2, oversampling=2, weighting=weighting)
-        for weighting in ('uniform', 'astrometric')]
-    yield 'moments', lambda: [package.adaptive_moments(one) for one in (
-        stamp, psf.mixture_at(0, 0))]
-    yield 'PSF of stars', lambda: package.fit_mixture_field(
-        data, stars, error=error, n_components=1, degree=0)
-    yield 'crowded fields', lambda: [
-        package.CrowdedMixturePhotometry(one)(data, error=error)
-        for one in (psf, integrated)]
-    yield 'crowded fields in many images', lambda: _fit_images(
-        package, psf, data, error)
-    yield 'simulated images', lambda: _simulate(package, psf, matched)
+    # What takes longest comes first, so that all cores end together.
+    return {
+        'photometry': lambda: [
+            package.MixturePSFPhotometry(one, (5, 5), aperture_radius=3)(
+                data, error=error, init_params=stars, mask=error < 0)
+            for one in (psf, integrated)],
+        'mixtures of PSF images': lambda: [
+            package.fit_mixture(stamp, 2, oversampling=2, weighting=weighting)
+            for weighting in ('uniform', 'astrometric')],
+        'crowded fields': lambda: [
+            package.CrowdedMixturePhotometry(one)(data, error=error)
+            for one in (psf, integrated)],
+        'models and errors': lambda: _use_models(
+            package, psf, matched, data, error),
+        'photometry of several images': lambda: _fit_many(
+            package, (psf, integrated), data, error),
+        'PSF of stars': lambda: package.fit_mixture_field(
+            data, stars, error=error, n_components=1, degree=0),
+        'crowded fields in many images': lambda: _fit_images(
+            package, psf, data, error),
+        'simulated images': lambda: _simulate(package, psf, matched),
+        'moments': lambda: [package.adaptive_moments(one) for one in (
+            stamp, psf.mixture_at(0, 0))],
+    }
 
 
 def _scene(package):

@@ -135,7 +135,8 @@ def read_stack(data, error=None, mask=None, *, name='image'):
     """
     Read one image or many of one shape; tell if it was one.
 
-    As `read_pixels` with ``broadcast``. The data are a copy, (n, ny, nx)
+    As `read_pixels` with ``broadcast``, but images of PSFs without a pixel
+    that can be used are left to their fits. The data are a copy, (n, ny, nx)
     float64, contiguous.
 
     Returns
@@ -147,11 +148,15 @@ def read_stack(data, error=None, mask=None, *, name='image'):
     shape = (-1, *pixels.shape[-2:])
     # What was a list is an array of our own already.
     convert = np.asarray if isinstance(data, (list, tuple)) else np.array
-    return PixelData(
+    images = PixelData(
         convert(pixels.data, np.float64, order='C').reshape(shape),
         *(None if array is None else array.reshape(shape)
           for array in (pixels.error, pixels.mask)),
-        pixels.unit), pixels.data.ndim == 2
+        pixels.unit)
+    _warn_of_padding(PixelData(*(
+        None if array is None else array.reshape(-1, shape[-1])
+        for array in (images.data, images.error, images.mask))), name)
+    return images, pixels.data.ndim == 2
 
 
 def read_quantity(value, name):

@@ -162,11 +162,11 @@ def test_what_is_compiled_for_python_is_handed_on():
 
 def test_the_command_compiles_every_kernel():
     code = """
-from types import SimpleNamespace
-from photutils_mgauss.cli import compile_command
+from photutils_mgauss.cli.compile_command import compile_all
 from photutils_mgauss.kernels import jit
-compile_command.run(SimpleNamespace(quiet=True))
-print([name for name, kernel in jit.KERNELS.items() if not kernel.signatures])
+if __name__ == '__main__':
+    ready = [name for _, _, names, _ in compile_all() for name in names]
+    print(sorted(jit.KERNELS.keys() - set(ready)))
 """
     found = subprocess.run([sys.executable, '-c', code], check=True,
                            capture_output=True, text=True)

@@ -44,7 +44,7 @@ from photutils_mgauss import (
     select_psf_stars,
 )
 from photutils_mgauss.fitting import posterior
-from photutils_mgauss.utils.image import read_pixels
+from photutils_mgauss.utils.image import read_pixels, read_stack
 
 SHAPE = (41, 43)
 MIXTURE = GaussianMixture([1], [[0, 0]], [[[1.8, 0.2], [0.2, 1.6]]])
@@ -591,3 +591,15 @@ def test_a_part_without_data_is_said_if_it_is_not_masked(rng, sky, padding):
     # One without noise is no mosaic: it is a simulation.
     read_pixels(MIXTURE.render((200, 220), 90, 100, flux=1e4))
     read_pixels(np.zeros(SHAPE))
+
+
+def test_padding_of_a_stack_is_said(rng):
+    stack = 300 + rng.normal(0, 17, (5, 40, 50))
+    stack[3:] = 0
+    with pytest.warns(AstropyUserWarning, match='40 % of the pixels of image '
+                      'have exactly the value 0'):
+        read_stack(stack)
+    read_stack(stack, mask=stack == 0)
+    # Images of PSFs end in zeros, and have no noise.
+    read_stack(np.stack([MIXTURE.render((60, 60), 30, 30)] * 3) *
+               (np.hypot(*(np.indices((60, 60)) - 30)) < 20))
