@@ -146,7 +146,7 @@ def test_the_page_puts_the_second_seed_beside_the_first(store):
 @pytest.mark.usefixtures('store')
 def test_sources_are_the_same_only_where_they_are_close_both_ways():
     from astropy.coordinates import SkyCoord
-    from sky_figures import _same
+    from sky_measures import _same
     true = SkyCoord([10.0, 10.001], [0.0, 0.0], unit='deg')
     found = SkyCoord(10 + np.array([0.04, 0.1, 3.0, 3.7]) / 3600,
                      np.zeros(4), unit='deg')
@@ -190,3 +190,99 @@ def test_positions_keep_all_their_digits_until_they_are_summed_up(store,
     run.table('one', lambda: table_of(place), keep=False)
     again = run.table('one', lambda: table_of(0.0), keep=False)
     assert again['value'][0] == place
+
+
+@pytest.mark.usefixtures('store')
+def test_images_that_went_through_files_are_the_same_but_for_rounding():
+    from scenes import through_files
+
+    from photutils_mgauss import (
+        DetectorEffects,
+        Instrument,
+        simulate,
+        sparse_field,
+    )
+    scene = simulate(sparse_field((90, 80), rng=1), rng=2,
+                     effects=DetectorEffects.typical(),
+                     instrument=Instrument(shape=(90, 80)))
+    read = through_files(scene)
+    assert scene.mask.any()
+    np.testing.assert_array_equal(read.mask, scene.mask)
+    np.testing.assert_allclose(read.image, scene.image, rtol=1e-5)
+    good = ~scene.mask
+    np.testing.assert_allclose(read.error[good], scene.error[good],
+                               rtol=1e-5)
+    assert np.isfinite(read.error).all()
+
+
+@pytest.mark.usefixtures('store')
+def test_a_program_that_is_not_there_is_said_to_be_absent(monkeypatch):
+    from daophot import daophot
+    from peers import AbsentError
+    monkeypatch.setenv('PATH', '')
+    with pytest.raises(AbsentError, match='apt-get install iraf-noao'):
+        daophot(None, None, None, 1)
+
+
+@pytest.mark.usefixtures('store')
+def test_daophot_finds_the_stars_where_they_are(monkeypatch):
+    from daophot import daophot
+    from peers import AbsentError, program
+    try:
+        program('DAOPHOT', 'irafcl')
+    except AbsentError as error:
+        pytest.skip(str(error))
+    from photutils_mgauss import Instrument, simulate, sparse_field
+    scene = simulate(sparse_field((300, 310), spacing=40, rng=1), rng=2,
+                     instrument=Instrument(shape=(300, 310)))
+    true = scene.truth[scene.truth['inside']]
+    true = true[np.argsort(true['mag'])]
+    bright = QTable({'x': true['x'].value[:20], 'y': true['y'].value[:20]})
+    found = daophot(scene, scene, bright, 0)
+    away = np.hypot(
+        *(found[c][:, None] - bright[c] for c in 'xy')).min(axis=0)
+    # Convention of the first pixel, and the scale of the fluxes.
+    assert np.median(away) < 0.05
+    nearest = np.hypot(*(found[c][:, None] - bright[c]
+                         for c in 'xy')).argmin(axis=0)
+    ratio = found['flux'][nearest] / true['flux'].value[:20]
+    assert abs(np.median(ratio) - 1) < 0.3
+
+
+@pytest.mark.usefixtures('store')
+@pytest.mark.parametrize(('ours', 'again', 'spread'), [
+    ('0.86 mas', '0.76 mas', '0.07'),
+    ('-0.0010 +- 0.0325', '+0.0010 +- 0.0325', '0.0014, 0.0000'),
+    ('1.31 / 2.21; 2.10 mas (35 stars)', '1.31 / 2.21; 2.10 mas (9 stars)',
+     ''),
+    ('5.0', '5.0, 6.0', '')])
+def test_the_spread_is_what_two_values_say_of_the_scatter(ours, again,
+                                                          spread):
+    from summary import spread_of
+    assert spread_of(ours, again) == spread
+
+
+@pytest.mark.usefixtures('store')
+def test_the_page_says_what_each_seed_costs_and_which_code_ran(store,
+                                                               tmp_path):
+    import summary
+    from settings import QUICK
+    runs = [store.Run(QUICK, 'mixtures', tmp_path / f'{seed}', seed=seed)
+            for seed in range(2)]
+    for run in runs:
+        with run.step('sky'):
+            run.table('one', lambda: table_of(sum(range(100_000))))
+    summary.write(runs[0], [], [], 'COMMAND', [(runs[1], {})])
+    page = (runs[0].folder / 'summary.rst').read_text()
+    for words in ('Wall, seed 0 [s]', 'CPU, seed 1 [s]', 'COMMAND',
+                  store.versions()['photutils_mgauss'],
+                  store.provenance()['date'], 'drawn and measured twice'):
+        assert words in ' '.join(page.split())
+
+
+@pytest.mark.usefixtures('store')
+def test_dates_alone_say_how_little_more_observations_help():
+    from sky_figures import dates_alone
+    # Two dates that are 3.607 years apart.
+    assert dates_alone((0, 6)) == pytest.approx(np.sqrt(2) / 3.607, rel=1e-3)
+    assert dates_alone(range(7)) == pytest.approx(0.355, abs=0.001)

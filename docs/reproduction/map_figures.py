@@ -115,6 +115,8 @@ def draw(name, error, tables):
     bar = canvas.colorbar(shown, ax=axes, label=ERRORS[error], shrink=0.7,
                           extend='both')
     bar.ax.tick_params(direction='out')
+    canvas.supxlabel('x on the detector [pix]', fontsize=8)
+    canvas.supylabel('y on the detector [pix]', fontsize=8)
     return canvas
 
 
@@ -138,7 +140,7 @@ def _panel(ax, part, name, limit):
                       cmap='RdBu_r', vmin=-limit, vmax=limit,
                       extent=(0, 9216, 0, 9216))
     ax.set(xticks=[0, 9216], yticks=[0, 9216])
-    ax.tick_params(labelsize=5, direction='out', top=False, right=False)
+    ax.tick_params(labelsize=6, direction='out', top=False, right=False)
     ax.set_title(f'#{part["detector"][0]:02d} {part["band"][0]}: '
                  f'{np.nanmedian(values):+.4f} $\\pm$ '
                  f'{np.nanstd(values):.4f}', fontsize=6.5)

@@ -1,5 +1,6 @@
 """Other programs, run for real where they are installed."""
 import importlib.util
+import re
 import shutil
 import subprocess
 import sys
@@ -21,6 +22,7 @@ INSTALL = {
     'photutils': 'pip install photutils',
     'GalSim': 'pip install galsim',
     'DAOPHOT': 'apt-get install iraf-noao',
+    'IRAF': 'apt-get install iraf',
     'DOLPHOT': 'in neither Debian nor PyPI',
 }
 
@@ -44,7 +46,8 @@ def _require(name, found):
         raise absent(name)
 
 
-def _program(name, *commands):
+def program(name, *commands):
+    """Return the path of the first of the commands that is there."""
     for command in commands:
         if path := shutil.which(command):
             return path
@@ -55,16 +58,18 @@ def program_versions(crowdsource_python=None):
     """Return the versions of the programs that are installed."""
     found = {}
     for name, commands in (('SExtractor', ('source-extractor', 'sex')),
-                           ('PSFEx', ('psfex',))):
+                           ('PSFEx', ('psfex',)),
+                           ('IRAF', ('irafcl',))):
         try:
-            path = _program(name, *commands)
+            path = program(name, *commands)
         except AbsentError:
             continue
-        result = subprocess.run([path, '--version'], check=False, text=True,
+        option = '-v' if name == 'IRAF' else '--version'
+        result = subprocess.run([path, option], check=False, text=True,
                                 capture_output=True)
-        words = (result.stdout + result.stderr).split()
-        found[name] = words[words.index('version') + 1] if (
-            'version' in words) else 'unknown'
+        number = re.search(r'[vV](?:ersion )?(\d[\d.]*)',
+                           result.stdout + result.stderr)
+        found[name] = number[1] if number else 'unknown'
     if number := _crowdsource_version(crowdsource_python):
         found['crowdsource'] = number
     return found
@@ -87,7 +92,7 @@ def sextractor(scene, *, psf=None, threshold=1.5, vignettes=None,
 
     Returns a table with the columns of SExtractor, pixels counted from 1.
     """
-    program = _program('SExtractor', 'source-extractor', 'sex')
+    command = program('SExtractor', 'source-extractor', 'sex')
     columns = list(_COLUMNS)
     if psf is not None:
         columns += ['XPSF_IMAGE', 'YPSF_IMAGE', 'FLUX_PSF']
@@ -113,33 +118,33 @@ def sextractor(scene, *, psf=None, threshold=1.5, vignettes=None,
             'VERBOSE_TYPE': 'QUIET', 'NTHREADS': 1}
         if psf is not None:
             options['PSF_NAME'] = psf
-        _call(program, folder, 'image.fits', options)
+        _call(command, folder, 'image.fits', options)
         if vignettes is not None:
             shutil.copy(folder / 'out.fits', vignettes)
         return Table(fits.getdata(folder / 'out.fits', 2))
 
 
-def _call(program, folder, target, options):
+def _call(command, folder, target, options):
     words = [str(word) for key, value in options.items()
              for word in (f'-{key}', value)]
     # No file of settings but these: the program's own defaults for the rest.
     (folder / 'none').write_text('')
-    done = subprocess.run([program, target, '-c', 'none', *words], text=True,
+    done = subprocess.run([command, target, '-c', 'none', *words], text=True,
                           cwd=folder, check=False, capture_output=True)
     if done.returncode:
-        msg = f'{Path(program).name} ended with: {done.stderr.strip()[-300:]}'
+        msg = f'{Path(command).name} ended with: {done.stderr.strip()[-300:]}'
         raise AbsentError(msg)
 
 
 def psfex(scene, degree, path):
     """Make a PSFEx model, written to a path, from the stars of a scene."""
-    program = _program('PSFEx', 'psfex')
+    command = program('PSFEx', 'psfex')
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         sextractor(scene, vignettes=folder / 'stars.cat')
-        _call(program, folder, 'stars.cat', {
+        _call(command, folder, 'stars.cat', {
             'BASIS_TYPE': 'PIXEL', 'PSF_SAMPLING': 0.5, 'PSF_SIZE': '51,51',
             'PSF_RECENTER': 'Y', 'CENTER_KEYS': 'XWIN_IMAGE,YWIN_IMAGE',
             'PHOTFLUX_KEY': 'FLUX_APER(1)',

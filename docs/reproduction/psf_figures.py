@@ -1,6 +1,7 @@
 """The PSF, its Gaussians, their posterior: Figs. 1-3, Appendices A, B."""
 import numpy as np
 from astropy.table import QTable
+from matplotlib.colors import LogNorm, SymLogNorm
 from scenes import detector
 from settings import PIXEL, STAMP_RADIUS
 from store import Comparison, Figure, Group
@@ -13,7 +14,6 @@ from photutils_mgauss import (
     sample_mixture,
 )
 from photutils_mgauss.plotting import (
-    plot_comparison_of_numbers,
     plot_ellipses,
     plot_model_graph,
     plot_posterior,
@@ -62,6 +62,8 @@ def _components(stamp):
 
 def _numbers(stamp):
     table = compare_n_components(stamp, (1, 2, 3, 4, 5), **FIT)
+    table['residual'] = [fit.residual / stamp.max()
+                         for fit in table.meta['fits']]
     table.meta.clear()
     return table
 
@@ -101,10 +103,14 @@ def compare_image(tables):
 
 
 def draw_graph(tables):
-    """Draw Fig. 2: the Bayesian model."""
-    canvas = canvas_of(2.8)
+    """Draw Fig. 2: the Bayesian model, with the letters of the paper."""
+    canvas = canvas_of(2.4)
     side = len(cut(tables['image']['sample']))
-    plot_model_graph(3, (side, side), ax=canvas.subplots())
+    ax = plot_model_graph(3, (side, side), ax=canvas.subplots())
+    for text in ax.texts:
+        name, _, rest = text.get_text().partition('\n')
+        if name and name != 'image':
+            text.set_text(f'$\\{name}$\n{rest}')
     return canvas
 
 
@@ -140,9 +146,27 @@ def compare_components(tables):
 def draw_numbers(tables):
     """Draw Appendix B: residuals for one, three and five Gaussians."""
     stamp = cut(tables['image']['sample'])
-    table = compare_n_components(stamp, (1, 3, 5), **FIT)
-    canvas = canvas_of(2.1)
-    plot_comparison_of_numbers(stamp, table, axes=canvas.subplots(1, 4))
+    canvas = canvas_of(2.2)
+    first, *others = canvas.subplots(1, 4, sharey=True)
+    side = (HALF + 0.5) / 2 * PIXEL
+    frame = {'origin': 'lower', 'extent': (-side, side, -side, side)}
+    # Linear below a thousandth of the peak, so that all residuals are seen.
+    faint = {'linthresh': 1e-3, 'base': 10}
+    shown = first.imshow(stamp / stamp.max(), norm=LogNorm(1e-4, 1), **frame)
+    first.set(title='PSF', xlabel='x [arcsec]', ylabel='y [arcsec]')
+    canvas.colorbar(shown, ax=first, location='bottom', label='of the peak',
+                    ticks=[1e-4, 1e-2, 1])
+    rows = tables['numbers'][np.isin(tables['numbers']['n_components'],
+                                     (1, 3, 5))]
+    for ax, row in zip(others, rows, strict=True):
+        shown = ax.imshow(row['residual'], cmap='RdBu_r', norm=SymLogNorm(
+            vmin=-0.1, vmax=0.1, **faint), **frame)
+        ax.set(title=f'K = {row["n_components"]}, {1e3 * row["time"]:.0f} ms',
+               xlabel='x [arcsec]')
+    canvas.colorbar(shown, ax=others, location='bottom', shrink=0.6,
+                    label='residual, of the peak', extend='both',
+                    ticks=[-0.1, -0.01, -0.001, 0, 0.001, 0.01, 0.1],
+                    format='%g')
     return canvas
 
 
@@ -203,8 +227,9 @@ def draw_posterior(tables):
         plot_trace(posterior, name, ax=right)
         right.set_xlabel('every second draw')
         left.locator_params(axis='x', nbins=6)
-        for ax in (left, right):
-            ax.legend(fontsize=6, ncols=2)
+        # Between the panels, where it hides no curve; both have its colours.
+        left.legend(loc='upper left', bbox_to_anchor=(1, 1))
+        right.get_legend().remove()
     return canvas
 
 
@@ -233,7 +258,8 @@ GROUPS = (
                draw_components, compare_components),
         Figure('appendix_b', 'Appendix B: the number of Gaussians',
                'Residuals for one, three and five Gaussians, by '
-               '``compare_n_components``; time is that of one least-squares '
+               '``compare_n_components``, from the fits of the table below; '
+               'time is that of one least-squares '
                'fit. One Gaussian has the size and ellipticity of the image '
                'by construction, because adaptive moments are those of the '
                'Gaussian that matches it best: what it lacks shows in the '

@@ -86,7 +86,7 @@ def main(argv=None):
     for seed in range(1, options.seeds):
         other = replace(run, seed=seed, skipped={}, made=[],
                         folder=run.folder / 'partial' / f'seed_{seed}')
-        again.append(make_all(other, options.figures, False))
+        again.append((other, make_all(other, options.figures, False)))
     summary.write(run, [done[key] for key in ORDER if key in done],
                   [key for key in ORDER if key not in done],
                   command(options), again)

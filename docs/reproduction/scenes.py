@@ -1,8 +1,11 @@
 """A detector: its true PSF, a sparse exposure, models of its PSF."""
-from dataclasses import dataclass
+import tempfile
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
+from astropy.io import fits
 from photutils.background import Background2D
 from photutils.detection import DAOStarFinder
 from scipy.spatial import cKDTree
@@ -86,9 +89,10 @@ class Detector:
         stars = sparse_field((self.size, self.size),
                              spacing=self.run.settings.spacing,
                              rng=100_000 + seed)
-        return simulate(stars, Exposure(band=self.band, detector=self.number),
-                        psf=self.light, effects=effects(), rng=200_000 + seed,
-                        instrument=Instrument(shape=(self.size, self.size)))
+        return through_files(simulate(
+            stars, Exposure(band=self.band, detector=self.number),
+            psf=self.light, effects=effects(), rng=200_000 + seed,
+            instrument=Instrument(shape=(self.size, self.size))))
 
     @cached_property
     def psf_stars(self):
@@ -146,6 +150,25 @@ def forget(size):
     for key in [key for key in _made if key[2] == size
                 and key[1] not in TABLE_2_DETECTORS]:
         del _made[key]
+
+
+def through_files(scene):
+    """
+    Return a scene as a pipeline delivers it, in three FITS files.
+
+    They are the image [electron / s], its flags (``_flg``) and its inverse
+    variance (``_wht``); all that is measured is measured from them.
+    """
+    time = scene.instrument.exposure_time
+    with tempfile.TemporaryDirectory() as folder:
+        paths = scene.write(Path(folder) / 'image.fits', layout='csst')
+        image, flags, weight = (fits.getdata(path) for path in paths[:3])
+    good = weight > 0
+    # The error of a bad pixel, which is masked, only has to be a number.
+    error = np.full(weight.shape, time / np.sqrt(np.median(weight[good])))
+    error[good] = time / np.sqrt(weight[good].astype(float))
+    return replace(scene, image=time * image.astype(float), error=error,
+                   flags=flags)
 
 
 def background_free(scene):

@@ -2,9 +2,12 @@
 import datetime as dt
 import platform
 import resource
+import shutil
+import subprocess
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import pairwise
 from pathlib import Path
@@ -39,6 +42,8 @@ class Run:
         What was left out, and why; filled on the way.
     made : list of str
         The tables that this call has measured; filled on the way.
+    steps : list of str
+        The step that is under way, in a list; changed on the way.
     """
 
     settings: object
@@ -49,6 +54,7 @@ class Run:
     seed: int = 0
     skipped: dict = field(default_factory=dict)
     made: list = field(default_factory=list)
+    steps: list = field(default_factory=lambda: ['none'])
 
     @property
     def fingerprint(self):
@@ -63,9 +69,13 @@ class Run:
             if found.meta.get('settings') == self.fingerprint:
                 return found
         self.made.append(name)
+        before = time.perf_counter(), _cpu_seconds()
         # What is measured again from must keep all its digits.
         table = _rounded(function()) if keep else QTable(function())
-        table.meta |= {'settings': self.fingerprint, **provenance()}
+        table.meta |= {
+            'settings': self.fingerprint, 'step': self.steps[-1],
+            'wall': round(time.perf_counter() - before[0], 2),
+            'cpu': round(_cpu_seconds() - before[1], 2), **provenance()}
         path.parent.mkdir(parents=True, exist_ok=True)
         table.write(path, overwrite=True)
         return table
@@ -79,25 +89,39 @@ class Run:
 
     @contextmanager
     def step(self, name):
-        """Note what a step costs, unless everything was there already."""
-        before = len(self.made), time.perf_counter(), _cpu_seconds()
-        yield
-        if len(self.made) == before[0]:
-            return
-        cost = QTable({'step': [name], 'seed': [self.seed],
-                       'wall': [time.perf_counter() - before[1]],
-                       'cpu': [_cpu_seconds() - before[2]]})
-        path = self.folder / 'partial' / f'cost_{name}.ecsv'
-        path.parent.mkdir(parents=True, exist_ok=True)
-        cost.write(path, overwrite=True)
+        """Say to which step the tables belong that are measured within."""
+        self.steps.append(name)
+        try:
+            yield
+        finally:
+            self.steps.pop()
+
+    def stored(self):
+        """Return what is written above each table of these settings."""
+        found = [_notes(path, path.stat().st_mtime_ns)
+                 for kind in ('tables', 'partial')
+                 for path in sorted((self.folder / kind).glob('*.ecsv'))]
+        return [one for one in found
+                if one.get('settings') == self.fingerprint]
 
     def costs(self):
-        """Return wall and CPU time [s] by the name of the step."""
+        """
+        Return wall and CPU time [s] by the name of the step.
+
+        They are summed over the tables of a step, so that a run that was
+        stopped and went on counts all its parts.
+        """
         found = {}
-        for path in (self.folder / 'partial').glob('cost_*.ecsv'):
-            row = QTable.read(path)[0]
-            found[row['step']] = float(row['wall']), float(row['cpu'])
+        for one in self.stored():
+            wall, cpu = found.get(one['step'], (0.0, 0.0))
+            found[one['step']] = wall + one['wall'], cpu + one['cpu']
         return found
+
+
+@cache
+def _notes(path, _changed):
+    """Return what is written above a table, read once while it is as it is."""
+    return QTable.read(path).meta
 
 
 def _cpu_seconds():
@@ -135,10 +159,26 @@ def versions():
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    if 'photutils_mgauss' not in found:
-        from photutils_mgauss import __version__
-        found = {'photutils_mgauss': __version__, **found}
-    return found
+    return {**found, 'photutils_mgauss': _code_version()}
+
+
+@cache
+def _code_version():
+    """
+    Return the version of the code that runs.
+
+    In a checkout that is its revision: what an installation noted may be
+    another one.
+    """
+    import photutils_mgauss
+    git = shutil.which('git')
+    done = git and subprocess.run(
+        [git, '-C', Path(photutils_mgauss.__file__).parent, 'describe',
+         '--always', '--dirty', '--exclude=*'], text=True, check=False,
+        capture_output=True)
+    if not done or done.returncode:
+        return photutils_mgauss.__version__
+    return f'revision {done.stdout.strip()}'
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@ from pathlib import Path
 
 from matplotlib import colormaps
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 # The colours of Okabe and Ito, and marks that differ as well.
 COLOURS = ('#0072B2', '#E69F00', '#009E73', '#CC79A7', '#D55E00', '#56B4E9',
@@ -21,5 +22,13 @@ def canvas_of(height, width=PAGE):
 
 
 def canvas_colours(n):
-    """Return n steps of a colour map that grows lighter."""
-    return colormaps['cividis'].resampled(n)
+    """Return n steps of a colour map that grows darker."""
+    return colormaps['cividis_r'].resampled(n)
+
+
+def plain_log(ax):
+    """Make the y axis logarithmic, with 0.5, 1, 2 and so on as numbers."""
+    ax.set_yscale('log')
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+    ax.yaxis.set_minor_formatter(NullFormatter())

@@ -1,20 +1,23 @@
 """The page: every figure with its numbers beside the printed ones."""
+import re
 import textwrap
 
 import numpy as np
 from peers import program_versions
 from settings import FULL
-from store import provenance
+from store import PACKAGES
 
 _HEAD = """\
-The paper reproduced: results
-=============================
+{title}
+{rule}
 
 .. This page is written by docs/reproduction/reproduce.py.
 
-Made on {date} with ``{command}``, with
+Measured on {date} by
 
 {versions}
+
+with ``{command}``.
 
 {sizes}
 
@@ -49,28 +52,44 @@ _OPTICS = {
 
 def write(run, done, missing, command, again):
     """Write the page of the figures that were made."""
-    parts = [_head(run, missing, command, len(again))]
+    parts = [_head(run, missing, command, [other for other, _ in again])]
     for figure, lines in done:
-        others = [one[figure.key][1] for one in again if figure.key in one]
+        others = [one[figure.key][1] for _, one in again if figure.key in one]
         parts.append(_section(run, figure, lines, others, command))
     (run.folder / 'summary.rst').write_text('\n'.join(parts))
 
 
-def _head(run, missing, command, n_again):
-    found = provenance() | program_versions(run.crowdsource_python)
-    versions = ', '.join(f'{name} {value}' for name, value in found.items()
-                         if name not in ('date', 'machine'))
+def _head(run, missing, command, others):
     seeds = ('Everything was drawn and measured twice: the column *again* has '
-             'the numbers of the second seed.' if n_again else
+             'the numbers of the second seed, and *spread* is what the two '
+             'say of the standard deviation of one, their difference over '
+             'the root of 2.' if others else
              'There is one seed: another one gives other numbers.')
     repel = ('Charge repels charge (brighter-fatter) in all of them.'
              if run.optics == 'galsim' else
              'The brighter-fatter effect is off, because GalSim is not '
              'installed.')
+    notes = [note for one in (run, *others) for note in one.stored()]
+    title = f'The paper reproduced: results, size {run.settings.name}'
     return _HEAD.format(
-        date=found['date'], command=command, versions=_filled(versions),
+        title=title, rule='=' * len(title), date=_values(notes, 'date'),
+        command=command, versions=_filled(_versions(run, notes)),
         sizes=_filled(_sizes(run)), skipped=_skipped(run, missing),
-        seeds=seeds, repel=repel, costs=_costs(run))
+        seeds=seeds, repel=repel, costs=_costs(run, others))
+
+
+def _values(notes, name):
+    """Return the values of a name that tables note, in words."""
+    return ' and '.join(sorted({note[name] for note in notes
+                                if name in note}))
+
+
+def _versions(run, notes):
+    """Return the versions of the code that measured the tables."""
+    found = {name: _values(notes, name) for name in ('python', *PACKAGES)}
+    found |= program_versions(run.crowdsource_python)
+    return ', '.join(f'{name} {value}' for name, value in found.items()
+                     if value)
 
 
 def _sizes(run):
@@ -90,17 +109,23 @@ def _sizes(run):
         f'most {s.psf_stars} (the stars of 135 pointings: about 3400).')
 
 
-def _costs(run):
-    """Return the table of what steps cost."""
-    rows = ['.. list-table::', '   :header-rows: 1', '', '   * - Step',
-            '     - Wall [s]', '     - CPU [s]',
-            '     - CPU of a full run, estimated [h]']
-    costs = [(name, *cost, cost[1] * full_work(name, run.settings) / 3600)
-             for name, cost in sorted(run.costs().items())]
-    total = np.sum([one[1:] for one in costs], axis=0)
-    for name, wall, cpu, hours in [*costs, ('together, of one seed', *total)]:
-        rows += [f'   * - {name}', f'     - {wall:.0f}', f'     - {cpu:.0f}',
-                 f'     - {hours:.2f}']
+def _costs(run, others):
+    """Return the table of what steps cost, seed by seed."""
+    each = [one.costs() for one in (run, *others)]
+    rows = ['.. list-table::', '   :header-rows: 1', '', '   * - Step']
+    for one in (run, *others):
+        rows += [f'     - Wall, seed {one.seed} [s]',
+                 f'     - CPU, seed {one.seed} [s]']
+    rows.append('     - CPU of a full run, estimated [h]')
+    costs = [(name, *np.ravel([one.get(name, (np.nan, np.nan))
+                               for one in each]),
+              each[0][name][1] * full_work(name, run.settings) / 3600)
+             for name in sorted(each[0])]
+    total = np.nansum([one[1:] for one in costs], axis=0)
+    for name, *seconds, hours in [*costs, ('together', *total)]:
+        rows += [f'   * - {name}', *(
+            f'     - {one:.0f}' if np.isfinite(one) else '     -'
+            for one in seconds), f'     - {hours:.2f}']
     return '\n'.join(rows)
 
 
@@ -159,7 +184,7 @@ def _section(run, figure, lines, others, command):
 # Figures that share tables: how the names of these begin.
 _SHARED = {'fig2': 'fig1_', 'fig4': 'fig4_', 'fig5': 'fig4_',
            'fig6': 'fig4_', 'fig7': 'fig4_', 'fig9': 'fig9_',
-           'fig10': 'fig9_', 'fig13': 'none'}
+           'fig10': 'fig9_'}
 
 
 def _prefix(key):
@@ -169,13 +194,38 @@ def _prefix(key):
 def _table(lines, others):
     """Return the table of lines, with what the second seed gave."""
     other = {line.quantity: line.ours for one in others for line in one}
-    rows = ['.. list-table::', '   :header-rows: 1',
-            '   :widths: 42 18 16 12 12', '', '   * - Quantity',
-            '     - Printed', '     - Ours', '     - Again',
-            '     - Judgement']
+    names = ['Quantity', 'Printed', 'Ours', *(['Again', 'Spread'] if other
+                                              else []), 'Judgement']
+    widths = '36 14 15 13 10 12' if other else '42 18 22 18'
+    rows = ['.. list-table::', '   :header-rows: 1', f'   :widths: {widths}',
+            '']
+    rows += _row(names)
     for line in lines:
-        rows += [f'   * - {line.quantity}', f'     - {line.printed}',
-                 f'     - {line.ours}',
-                 f'     - {other.get(line.quantity, "")}'.rstrip(),
-                 f'     - {line.verdict}'.rstrip()]
+        again = other.get(line.quantity, '')
+        seeds = [again, spread_of(line.ours, again)] if other else []
+        rows += _row([line.quantity, line.printed, line.ours, *seeds,
+                      line.verdict])
     return [*rows, '']
+
+
+def _row(cells):
+    return [f'{"   * -" if k == 0 else "     -"} {cell}'.rstrip()
+            for k, cell in enumerate(cells)]
+
+
+def spread_of(ours, again):
+    """
+    Return how far numbers in two texts are apart, over the root of 2.
+
+    That is the standard deviation of one, as two values give it. Numbers in
+    brackets are no results.
+    """
+    first, second = (re.findall(r'-?\d+(?:\.\d+)?', re.sub(
+        r'\(.*?\)', '', text)) for text in (ours, again))
+    if len(first) != len(second):
+        return ''
+    found = [abs(float(a) - float(b)) / np.sqrt(2)
+             for a, b in zip(first, second, strict=True)]
+    digits = [len(a.partition('.')[2]) for a in first]
+    return ', '.join(f'{value:.{n}f}' for value, n in zip(
+        found, digits, strict=True)) if any(found) else ''

@@ -82,10 +82,15 @@ class ImageRenderer:
 
 def renderer_of(psf):
     """Return what draws stars with a PSF."""
+    return (MixtureRenderer if _is_mixture(psf) else ImageRenderer)(psf)
+
+
+def _is_mixture(psf):
+    """Return whether a PSF is a grid of mixtures, not one of images."""
     if isinstance(psf, GriddedMixturePSF):
-        return MixtureRenderer(psf)
+        return True
     if isinstance(psf, GriddedPSFModel):
-        return ImageRenderer(psf)
+        return False
     msg = ('psf must be a GriddedMixturePSF or a GriddedPSFModel, got '
            f'{type(psf).__name__}')
     raise TypeError(msg)
@@ -93,9 +98,10 @@ def renderer_of(psf):
 
 def widen(psf, stddev):
     """Return a PSF convolved with a round Gaussian [pix]."""
+    mixture = _is_mixture(psf)
     if stddev == 0:
         return psf
-    if isinstance(psf, GriddedMixturePSF):
+    if mixture:
         return psf.convolve(stddev**2 * np.eye(2))
     sigma = stddev * np.broadcast_to(psf.oversampling, 2)
     images = [gaussian_filter(np.asarray(image, float), sigma,

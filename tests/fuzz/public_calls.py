@@ -335,9 +335,10 @@ def instruments():
         'paper_exposures': (mg.paper_exposures, {
             'ra': 10.0, 'dec': 20.0, 'offset': 3.0, 'rotation': .05,
             'scale': 1e-4, 'distortion': .5, 'rng': 2}),
-        'paper_scene': (mg.paper_scene, {
-            'field': 'ngp', 'shape': SHAPE, 'epoch': 3, 'psf': None,
-            'effects': None, 'rng': 1}),
+        # Without a shape it is a whole detector, which takes minutes.
+        'paper_scene': (partial(mg.paper_scene, shape=SHAPE), {
+            'field': 'ngp', 'epoch': 3, 'psf': None, 'effects': None,
+            'rng': 1}),
     }
 
 

@@ -113,3 +113,10 @@ def test_effects_are_on_unless_others_are_given():
 def test_a_scene_of_nonsense_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
         paper_scene(**options)
+
+
+@pytest.mark.parametrize('psf', ['what', 1.0, {'a': 1}])
+def test_what_is_no_psf_is_refused_whatever_the_detector_does(psf):
+    for effects in (None, DetectorEffects()):
+        with pytest.raises(TypeError, match='psf must be a GriddedMixture'):
+            paper_scene('ngp', (40, 50), psf=psf, effects=effects)
