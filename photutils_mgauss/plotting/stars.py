@@ -48,7 +48,7 @@ def plot_pulls(pulls, *, ax=None):
     >>> pulls = np.random.default_rng(1).normal(0, 1, 500)
     >>> ax = plotting.plot_pulls(pulls, ax=Figure().add_subplot())
     >>> ax.get_xlabel(), ax.get_legend_handles_labels()[1]
-    ('residual / error', ['500, rms 0.98', 'right errors'])
+    ('residual / error', ['500, rms 0.91', 'right errors'])
     """
     ax = current_axes(ax)
     pulls = np.asarray(pulls, float)

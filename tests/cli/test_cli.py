@@ -267,7 +267,8 @@ def test_without_its_image_a_catalogue_still_has_its_places(chain, tmp_path,
             np.asarray(one[column]), np.asarray(two[column]), rtol=1e-4,
             atol=1e-4)
     assert files_in(tmp_path / 'two') == [
-        'alignment.ecsv', 'motions.ecsv', 'residuals.ecsv']
+        'alignment.ecsv', 'frame_errors.ecsv', 'motions.ecsv',
+        'residuals.ecsv']
 
 
 def test_psfs_are_rewritten_and_used_in_the_other_format(chain, capsys):
