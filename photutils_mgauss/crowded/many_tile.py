@@ -17,7 +17,13 @@ from photutils_mgauss.crowded.many_equations import (
 )
 from photutils_mgauss.crowded.model import Model
 from photutils_mgauss.crowded.stars import Neighbours, Stars
-from photutils_mgauss.crowded.tile import CELL, REST, ROAM, TileOptions
+from photutils_mgauss.crowded.tile import (
+    CELL,
+    REST,
+    ROAM,
+    Searched,
+    TileOptions,
+)
 
 # Templates are drawn for so many parts of a pixel along each axis.
 _PHASES = 4
@@ -119,7 +125,7 @@ class SharedModel(Model):
         kernels.turn_stamps(chosen, self.stamps, self.slopes)
 
 
-class ManyTile:
+class ManyTile(Searched):
     """
     The models of all images of a `ManyJob`, their equations, and the stars.
 
@@ -136,11 +142,12 @@ class ManyTile:
     phases : list of kernels.Phases
     measured : (E, n) `~numpy.ndarray`
         Fluxes of all images, each free.
-    rejected, repeats, widths, moved
+    widths, moved
         As of `Tile`; ``widths`` are those of each image.
     """
 
     def __init__(self, job):
+        super().__init__()
         self.job, self.options = job, job.options
         self.origin, self.shape = job.origin, job.shape
         self.scales = job.scales[:, None]
@@ -148,7 +155,6 @@ class ManyTile:
         self.points = [one.points(job.shape) for one in job.maps]
         self.phases = [phases(part.psf, part.data.shape)
                        for part in job.parts]
-        self.rejected, self.repeats = np.empty((0, 2)), []
         self.widths = [np.empty(0)] * len(job.parts)
         self.moved = np.empty(0)
         self.stars = self._at_rest(Stars([], [], []))
@@ -383,17 +389,6 @@ class ManyTile:
             step = _step(np.where(restless[k], light[k], 0), shift)
             model.take_in_place(step, levels[k], np.flatnonzero(restless[k]))
         self._form_equations()
-
-    # What a search leaves behind.
-
-    def reject(self, places):
-        """Remember places (n, 2) where no star is to be added again."""
-        self.rejected = np.concatenate([self.rejected, places])
-
-    def note_repeats(self, entries, host):
-        """Remember which numbers' stars the entries of a list mean."""
-        self.repeats += zip(entries.number, host, entries.x_init,
-                            entries.y_init, strict=True)
 
     def note_widths(self, measure):
         """Remember by how much each image's PSF is too narrow."""
