@@ -4,12 +4,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from photutils_mgauss.crowded.correlated import noise_pairs
 from photutils_mgauss.crowded.solve import solve_tile
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.crowded.table import no_stars, tabulate
 from photutils_mgauss.crowded.tile import CELL, TileJob, TileOptions
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.checkpoint import Checkpoint, digest_of
+from photutils_mgauss.utils.correlated_noise import no_pairs
 from photutils_mgauss.utils.image import PixelData
 from photutils_mgauss.utils.parallel import Threads, tell
 
@@ -25,6 +27,7 @@ class Outcome:
     chi2: float = 0.0
     n_pixels: int = 0
     widths: np.ndarray = field(default_factory=lambda: np.empty(0))
+    pairs: np.ndarray = field(default_factory=no_pairs)
 
     @classmethod
     def of(cls, job):
@@ -35,19 +38,20 @@ class Outcome:
         model = tile.model
         chi = model.weight * model.residual**2
         return cls(tabulate(tile, job.core), float(chi.sum()),
-                   int(model.good.sum()), tile.widths)
+                   int(model.good.sum()), tile.widths, noise_pairs(model))
 
     @classmethod
     def of_arrays(cls, arrays):
         """Return what `arrays` made arrays of."""
-        widths = arrays.pop('tile_widths')
+        widths, pairs = arrays.pop('tile_widths'), arrays.pop('tile_pairs')
         chi2, n_pixels = arrays.pop('tile_sums')
         return cls(Stars.of_columns(arrays), float(chi2), int(n_pixels),
-                   widths)
+                   widths, pairs)
 
     def arrays(self):
         """Return all there is as a dict of arrays."""
         return {**vars(self.stars), 'tile_widths': self.widths,
+                'tile_pairs': self.pairs,
                 'tile_sums': np.array([self.chi2, self.n_pixels], float)}
 
 
