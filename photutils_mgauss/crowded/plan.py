@@ -17,6 +17,8 @@ from photutils_mgauss.utils.parallel import Threads, tell
 
 # The smallest and the largest size of tiles if none is given [pix].
 _TILES = (1024, 2048)
+# Pixels this far off the model are counted [standard deviations].
+_FAR = 5.0
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,7 @@ class Outcome:
     n_pixels: int = 0
     widths: np.ndarray = field(default_factory=lambda: np.empty(0))
     pairs: np.ndarray = field(default_factory=no_pairs)
+    n_far: int = 0
 
     @classmethod
     def of(cls, job):
@@ -36,23 +39,25 @@ class Outcome:
             return cls(no_stars())
         tile = solve_tile(job)
         model = tile.model
-        chi = model.weight * model.residual**2
-        return cls(tabulate(tile, job.core), float(chi.sum()),
-                   int(model.good.sum()), tile.widths, noise_pairs(model))
+        chi2 = model.weight * model.residual**2
+        return cls(tabulate(tile, job.core), float(chi2.sum()),
+                   int(model.good.sum()), tile.widths, noise_pairs(model),
+                   int((chi2 > _FAR**2).sum()))
 
     @classmethod
     def of_arrays(cls, arrays):
         """Return what `arrays` made arrays of."""
         widths, pairs = arrays.pop('tile_widths'), arrays.pop('tile_pairs')
-        chi2, n_pixels = arrays.pop('tile_sums')
+        chi2, n_pixels, n_far = arrays.pop('tile_sums')
         return cls(Stars.of_columns(arrays), float(chi2), int(n_pixels),
-                   widths, pairs)
+                   widths, pairs, int(n_far))
 
     def arrays(self):
         """Return all there is as a dict of arrays."""
         return {**vars(self.stars), 'tile_widths': self.widths,
                 'tile_pairs': self.pairs,
-                'tile_sums': np.array([self.chi2, self.n_pixels], float)}
+                'tile_sums': np.array([self.chi2, self.n_pixels, self.n_far],
+                                      float)}
 
 
 class Tiles:

@@ -19,6 +19,8 @@ from photutils_mgauss.utils.correlated_noise import correlation_of, no_pairs
 
 # A PSF whose size is off by more than this fraction is warned of.
 _WIDTH_TOLERANCE = 0.1
+# Otherwise, so is a share of pixels like this that are far off the model.
+_FAR_OFF = 0.1
 _CONFUSION = ('errors and fluxes allow for stars that were not found; what of '
               'their light the background takes is calibrated on simulated '
               'fields')
@@ -66,7 +68,7 @@ def _table(outcomes, plan, stacklevel):
     done = [outcome for outcome in outcomes if outcome is not None]
     outcomes.clear()
     stars = Stars.joined([no_stars(), *(outcome.stars for outcome in done)])
-    meta = _report(done, stacklevel + 1)
+    meta = _report(done, plan.options, stacklevel + 1)
     correlation = correlation_of(sum((one.pairs for one in done), no_pairs()))
     del done
     stars = allow_for_correlation(stars, correlation, plan.psf, plan.options)
@@ -83,10 +85,11 @@ def _table(outcomes, plan, stacklevel):
                      confusion=confusion), correlation
 
 
-def _report(done, stacklevel):
+def _report(done, options, stacklevel):
     widths = np.concatenate([o.widths for o in done]) if done else []
     n_pixels = sum(o.n_pixels for o in done)
     chi2 = sum(o.chi2 for o in done) / max(n_pixels, 1)
+    far = sum(o.n_far for o in done) / max(n_pixels, 1)
     # Undetected companions broaden stars: look at those least broadened.
     width = float(np.percentile(widths, 25)) if len(widths) >= 5 else np.nan
     if abs(width) > _WIDTH_TOLERANCE:
@@ -94,4 +97,11 @@ def _report(done, stacklevel):
         warnings.warn(f'the PSF is too {word}: the variance of the light '
                       f'of bright stars differs by {width:+.0%}',
                       AstropyUserWarning, stacklevel=stacklevel)
+    elif far > _FAR_OFF and options.find_neighbors:
+        warnings.warn(
+            f'stars and background do not describe the image, {far:.0%} of '
+            'its pixels are off by more than 5 standard deviations: check '
+            'that error is right, that the PSF is that of the image, and '
+            'that its light is positive', AstropyUserWarning,
+            stacklevel=stacklevel)
     return {'reduced_chi2': chi2, 'psf_size_difference': width}
