@@ -15,6 +15,7 @@ from photutils_mgauss import kernels
 from photutils_mgauss.crowded.search import (
     LEAST,
     REACH,
+    SEPARATION,
     apart,
     peaks,
     weakest,
@@ -87,10 +88,25 @@ def leave_out(tile, threshold):
     Returns their places (n, 2).
     """
     weak = weakest(tile.stars, tile.neighbours, strengths(tile), threshold,
-                   tile.shape)
+                   tile.shape) | _merged(tile)
     places = np.column_stack([tile.stars.x[weak], tile.stars.y[weak]])
     tile.dismiss(weak)
     return places
+
+
+def _merged(tile):
+    """
+    Tell which stars have come so near a brighter one that both are one.
+
+    Two stars at a place share its light, and seem to move apart.
+    """
+    s, pairs = tile.stars, tile.neighbours
+    near = np.hypot(s.x[pairs.owner] - s.x[pairs.neighbour],
+                    s.y[pairs.owner] - s.y[pairs.neighbour]) < SEPARATION
+    fainter = s.flux[pairs.neighbour] < s.flux[pairs.owner]
+    out = np.zeros(len(s), bool)
+    out[pairs.neighbour[near & fainter]] = True
+    return out & ~s.listed
 
 
 def strengths(tile):
