@@ -197,7 +197,8 @@ def crowd(tmp_path_factory):
     psf = GriddedMixturePSF([GaussianMixture.from_stddevs(
         [0.7, 0.3], [(0, 0), (0, 0)], [(0.8, 0.85), (1.6, 1.7)])], [(0, 0)])
     write_psf(psf, out / 'psf.fits', {})
-    places, motion = rng.uniform(2, 125, (2, 250)), rng.normal(0, 0.05, (2, 250))
+    places = rng.uniform(2, 125, (2, 250))
+    motion = rng.normal(0, 0.05, (2, 250))
     flux = 10**rng.uniform(3.2, 4.4, 250)
     for name, year in zip(NIGHTS, (-2.0, 0.5, 2.0), strict=True):
         wcs = WCS(naxis=2)
@@ -251,14 +252,22 @@ def test_stars_that_overlap_get_motions(crowd):
     assert_allclose(stars['pmra'].value, expected['pmra'].value)
 
 
-def test_a_crowd_needs_no_psf_and_takes_targets(crowd):
-    out = crowd / 'targets'
+def test_a_crowd_needs_no_psf_and_takes_targets(crowd, monkeypatch):
+    asked, out = [], crowd / 'targets'
+
+    def own_psf(image, _):
+        asked.append(image.path.stem)
+        return read_psf(crowd / 'psf.fits')
+    # It takes minutes, and has tests of its own.
+    monkeypatch.setattr('photutils_mgauss.cli.photometry.own_psf', own_psf)
     assert run_crowded(crowd, '--output', out, '--dry-run') in (0, None)
     assert not out.exists()
+    assert not asked
     assert run_crowded(crowd, '--output', out, '--targets',
                        crowd / 'truth.ecsv', '--band', 'g') in (0, None)
     stars, true = (QTable.read(path) for path in (
         out / 'motions.ecsv', crowd / 'truth.ecsv'))
+    assert asked == list(NIGHTS)
     assert len(stars) == len(true)
     bright = true['flux'] > 10000
     assert np.nanmedian(np.abs((stars['pmra'] - true['pmra'])[bright])) < (
