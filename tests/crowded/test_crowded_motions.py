@@ -40,7 +40,7 @@ def test_bright_stars_stay_single_where_the_psf_is_a_little_wrong():
     wcs.wcs.cdelt = -2e-5, 2e-5
     images = []
     for year in YEARS:
-        light = 40 + render_stars(a_psf(0.81), x + year * motion[0],
+        light = 40 + render_stars(a_psf(0.806), x + year * motion[0],
                                   y + year * motion[1], flux, (105, 105))
         images.append(ImageEpoch(rng.normal(light, np.sqrt(light)),
                                  a_psf(0.8), wcs, 2028 + year,
