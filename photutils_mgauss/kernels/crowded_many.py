@@ -353,26 +353,39 @@ def add_places(first, stars, pairs, factors, ties, together):
 
 @kernel(allocates=True)
 def invert_places(together):
-    """Overwrite together.free by its inverse, NaN where it has none."""
+    """
+    Overwrite together.free by its inverse, NaN where it has none.
+
+    Stars that cannot be told from all of their neighbours are taken with the
+    nearest ones only, the others where they are.
+    """
     largest, m = together.free.shape[1], together.members.shape[1]
+    p = largest // m
     scale, column = np.empty(largest), np.empty(largest)
     factor = np.empty((largest, largest))
     for i in range(together.count.size):
-        size = largest // m * together.count[i]
-        for a in range(size):
-            for b in range(size):
-                factor[a, b] = together.free[i, a, b]
-        scale_matrix(factor, size, scale)
-        solved = cholesky(factor, size, 1e-12)
-        for a in range(largest // m):
-            solved = solved and scale[a] > 0
-        for a in range(size):
-            for b in range(size):
+        free, whole = together.free[i], p * together.count[i]
+        count, solved = together.count[i], False
+        while count > 0 and not solved:
+            size = p * count
+            for a in range(size):
+                for b in range(size):
+                    factor[a, b] = free[a, b]
+            scale_matrix(factor, size, scale)
+            solved = cholesky(factor, size, 1e-12)
+            for a in range(p):
+                solved = solved and scale[a] > 0
+            if not solved:
+                count //= 2
+        for a in range(whole):
+            for b in range(whole):
+                free[a, b] = 0.0 if solved else np.nan
+        for a in range(p * count):
+            for b in range(p * count):
                 column[b] = 1.0 if a == b else 0.0
-            solve_factored(factor, size, column)
-            for b in range(size):
-                together.free[i, a, b] = (column[b] * scale[a] * scale[b]
-                                          if solved else np.nan)
+            solve_factored(factor, p * count, column)
+            for b in range(p * count):
+                free[a, b] = column[b] * scale[a] * scale[b]
 
 
 @kernel(allocates=True)
