@@ -323,7 +323,7 @@ def _review(setup, state, problem, frames):
     each = _measured_numbers(problem)
     bad = worst_outliers(estimates.chi2, state.used,
                          _spare(problem, each) & ~state.crooked,
-                         chi2_limits(setup.options.clip, each))
+                         setup.options.clip, each)
     if bad.any():
         return _rejected(setup, state, bad), True
     untied = state.untied | _inconsistent(setup, problem, estimates)
@@ -334,9 +334,9 @@ def _review(setup, state, problem, frames):
 def _measured_numbers(problem):
     """Return how many numbers each detection measures, (E, n)."""
     out = np.zeros(problem.weights.shape[1:], dtype=np.int8)
-    for e, row in enumerate(out):
+    for e in range(problem.n_epochs):
         weights = problem.weights[:, e]
-        row[:] = dimensions_2x2(weights) * (weights[0] + weights[2] > 0)
+        out[e] = dimensions_2x2(weights) * (weights[0] + weights[2] > 0)
     return out
 
 
@@ -472,17 +472,12 @@ def chi2_limit(clip, dof):
     return chdtri(dof, 2 * ndtr(-clip))
 
 
-def chi2_limits(clip, dimensions):
-    """Return the `chi2_limit` of 1 or 2 degrees of freedom for each."""
-    one, two = chi2_limit(clip, np.array([1, 2]))
-    return np.where(dimensions == 1, one, two)
-
-
-def worst_outliers(chi2, used, spare, limit):
+def worst_outliers(chi2, used, spare, clip, dimensions):
     """
     Return which detections to reject now, (E, n): each star's worst.
 
-    The worst is farthest beyond the ``limit`` (E, n) of its chi-square.
+    The worst is farthest beyond the `chi2_limit` of its chi-square, which
+    has 1 or 2 ``dimensions`` (E, n).
 
     Only one of a star's goes at a time, or a twentieth of many, because a
     bad one spoils the residuals of the good; and only where ``spare`` (n,)
@@ -490,7 +485,9 @@ def worst_outliers(chi2, used, spare, limit):
     """
     excess = np.nan_to_num(chi2, nan=0.0)
     excess[~used] = 0.0
-    excess /= limit
+    one, two = chi2_limit(clip, np.array([1, 2]))
+    for e, numbers in enumerate(dimensions):
+        excess[e] /= np.where(numbers == 1, one, two)
     worst = excess.argmax(axis=0)
     out = np.zeros(used.shape, dtype=bool)
     stars = np.arange(used.shape[1])
