@@ -22,6 +22,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 from photutils_mgauss.field import stages
+from photutils_mgauss.field.choice import is_better
 from photutils_mgauss.field.covariance import variation
 from photutils_mgauss.field.normal import equations, to_vector
 
@@ -39,7 +40,8 @@ def add_degree(fit, basis, degree, workers, *, reject=True):
     """
     Return a fit with the terms of one degree more.
 
-    It is the fit as it was if the stars do not ask for them.
+    It is the fit as it was if the stars do not ask for them, or those left
+    out become no more likely.
 
     Parameters
     ----------
@@ -58,25 +60,35 @@ def add_degree(fit, basis, degree, workers, *, reject=True):
     FieldFit
     """
     workers.tell(f'degree {degree + 1}')
-    before, terms = stages.n_terms(degree), stages.n_terms(degree + 1)
-    problem = fit.problem
-    scale = variation(fit)
-    wide = replace(fit, problem=problem.subset(np.arange(len(basis))),
-                   deviant_pixels=fit.deviant_pixels.copy())
-    wide.problem = replace(wide.problem, basis=np.ascontiguousarray(
-        np.hstack([basis[:, :terms], problem.extra])),
-        used=np.ones(len(basis), bool))
-    wide.deviant_pixels[~problem.used] = False
-    wide.coefficients = stages.raised(fit.coefficients, terms,
-                                      problem.n_extra)
-    wide.prior = _raised(fit.prior, terms)
-    sizes = _Sizes(wide, slice(before, terms), scale)
+    before = fit.problem.used
+    # A star may have been deviant for want of the new terms.
+    tries = [np.ones_like(before)] + [before] * (not before.all())
+    for used in tries:
+        wide = _wider(fit, basis, degree, used, workers, reject)
+        if wide is not None and is_better(fit, wide, workers):
+            return wide
+    return fit
+
+
+def _wider(fit, basis, degree, used, workers, reject):
+    """Return a fit of one degree more, from some stars, if it says more."""
+    new = slice(stages.n_terms(degree), stages.n_terms(degree + 1))
+    problem = fit.problem.subset(np.arange(len(basis)))
+    problem.basis = np.ascontiguousarray(
+        np.hstack([basis[:, :new.stop], problem.extra]))
+    problem.used = used.copy()
+    wide = replace(
+        fit, problem=problem, prior=_raised(fit.prior, new.stop),
+        coefficients=stages.raised(fit.coefficients, new.stop,
+                                   problem.n_extra),
+        deviant_pixels=fit.deviant_pixels & fit.problem.used[:, None, None])
+    sizes = _Sizes(wide, new, variation(fit))
     for i in range(_ROUNDS):
         stages.weigh(wide, reject=reject and i > 0, share=None)
         wide.equations = equations(wide.problem, wide.coefficients, workers)
         wide.prior, gain = sizes.most_likely()
         if gain < _GAIN:
-            return fit
+            return None
         stages.advance(wide, workers, tolerance=0.01, max_steps=10)
     return wide
 
@@ -97,11 +109,11 @@ class _Sizes:
     def most_likely(self):
         """Return the prior under which the stars are most likely, and why."""
         found = minimize(
-            lambda logs: -_evidence(self.fit, self.prior(logs)),
+            lambda logs: -evidence(self.fit, self.prior(logs)),
             np.full(3, _FIRST), method='Nelder-Mead', bounds=[_LIMITS] * 3,
             options={'xatol': _TOLERANCE, 'fatol': _TOLERANCE,
                      'maxiter': _MOST_STEPS})
-        least = _evidence(self.fit, self.prior(np.full(3, _LIMITS[0])))
+        least = evidence(self.fit, self.prior(np.full(3, _LIMITS[0])))
         return self.prior(found.x), 2 * (-found.fun - least)
 
     def prior(self, logs):
@@ -116,7 +128,7 @@ class _Sizes:
         return replace(self.fit.prior, precision=precision)
 
 
-def _evidence(fit, prior):
+def evidence(fit, prior):
     """Return the log likelihood of a prior, up to a constant."""
     diagonal = to_vector(prior.precision)
     factor = cho_factor(fit.equations.matrix + np.diag(diagonal))

@@ -167,6 +167,21 @@ def _left_out(fit, workers):
     return chi2
 
 
+def is_better(before, after, workers):
+    """
+    Return whether the second of two fits is the better one.
+
+    That which describes more of the stars or, of as many, that which those
+    left out of it are more like.
+    """
+    more = after.problem.used.sum() - before.problem.used.sum()
+    if more:
+        return more > 0
+    scores = _mean(np.array([_left_out(one, workers)
+                             for one in (before, after)]))
+    return scores[1] < scores[0]
+
+
 def _settled(problem, coefficients, workers):
     """Return the reduced chi^2 of stars whose own numbers are fitted."""
     stamps = problem.stamps

@@ -103,7 +103,9 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         The degree of the polynomials, 0 for a PSF that is the same
         everywhere; by default 4, or 'auto' with 8 to 59 stars, or 1 with
         ``start``. It is lowered, with a warning, if there are too few stars.
-        'auto' tries degrees from 0 to 5 in the same way. Terms that the stars
+        'auto' tries degrees from 0 to 5 in the same way; fewer than 60 stars
+        have one degree more, its terms as small as the stars ask for, where
+        left-out stars gain by it. Terms that the stars
         do not ask for are shrunk, so that a degree that is too high costs
         time more than accuracy.
     radius : float, optional
