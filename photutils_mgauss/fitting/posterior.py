@@ -31,6 +31,7 @@ from photutils_mgauss.utils.validation import (
     as_real,
     as_rng,
 )
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['MixturePosterior', 'sample_mixture']
 
@@ -330,12 +331,12 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
         raise ValueError(msg)
     draws = as_integer(draws, 'draws', minimum=4)
     data = SamplingData.prepare(image, fit, prior, unit, kwargs)
-    model = build_model(data)
     seed = None if rng is None else int(as_rng(rng).integers(2**31))
-    idata = sample(model, sampler, progressbar=progress_bar, cores=cores,
-                   random_seed=seed, draws=draws,
-                   tune=as_integer(tune, 'tune', minimum=0),
-                   chains=as_integer(chains, 'chains', minimum=1))
+    with waiting('sample_mixture', progress_bar):
+        idata = sample(build_model(data), sampler, progressbar=progress_bar,
+                       cores=cores, random_seed=seed, draws=draws,
+                       tune=as_integer(tune, 'tune', minimum=0),
+                       chains=as_integer(chains, 'chains', minimum=1))
     return _posterior(idata, data, fit, pixels.unit)
 
 
