@@ -273,9 +273,10 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
     ------
     TypeError, ValueError
         As by `fit_mixture`; also for a stack of images, without
-        ``pixel_scale`` for the paper's priors, or if a Gaussian has no flux
+        ``pixel_scale`` for the paper's priors, if a Gaussian has no flux
         in the least-squares solution, so that its shape has no posterior of
-        its own: use fewer.
+        its own: use fewer; or for an image without noise, which says nothing
+        of the width of its posterior: add what is expected.
 
     Notes
     -----
