@@ -4,8 +4,8 @@ How good a grid is.
 ePSFs with Airy rings, over a detector, turned into mixtures of three
 Gaussians: the error of the size at each node (as Figs. 4 to 7 of Nie et al.),
 the pixel-phase error, and the ellipticity as whiskers along the long axis.
-Below, for two, three and five Gaussians, what is left of the ePSF that is
-described worst: a pattern that one Gaussian could take up asks for more of
+Beside them, for two, three and five Gaussians, what is left of the ePSF that
+is described worst: a pattern that one Gaussian could take up asks for more of
 them.
 """
 import matplotlib.pyplot as plt
@@ -41,13 +41,14 @@ epsfs = GriddedPSFModel(NDData(
 psfs = {k: GriddedMixturePSF.from_gridded_psf(epsfs, n_components=k)
         for k in (2, 3, 5)}
 
-figure, axes = plt.subplots(2, 3, figsize=(13, 7.4), layout='constrained')
-maps, worst = axes
+figure, axes = plt.subplots(3, 2, figsize=(3.5, 5.4), layout='constrained')
+maps, worst = axes.T
 plot_node_map(psfs[3], 'size_error', ax=maps[0])
 plot_node_map(psfs[3], 'phase_error', ax=maps[1])
 plot_whiskers(psfs[3], ax=maps[2])
 for ax in maps:
-    ax.set_title(ax.get_title().replace(': ', '\n'), fontsize='medium')
+    ax.set_title(ax.get_title().partition(': ')[2].replace(', ', '\n'))
 for ax, (k, psf) in zip(worst, psfs.items(), strict=True):
     plot_worst_node(psf, epsfs, ax=ax)
-    ax.set_title(f'K = {k}\n{ax.get_title()}', fontsize='medium')
+    node, _, size = ax.get_title().partition('), ')
+    ax.set_title(f'K = {k}, {node})\n{size}')
