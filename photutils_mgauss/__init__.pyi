@@ -75,7 +75,8 @@ class CrowdedMixturePhotometry:
         progress_bar: bool = False, find_neighbors: bool = True,
         xy_bounds: float | None = 1.0,
         checkpoint: str | PathLike[str] | None = None, psf_errors: bool = True,
-        confusion: bool = True, saturation: float | Quantity | None = None,
+        confusion: bool = True, correlated_noise: bool = True,
+        saturation: float | Quantity | None = None,
         residual_radius: float | None = None,
     ) -> None: ...
     def __call__(

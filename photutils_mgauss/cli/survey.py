@@ -17,9 +17,9 @@ output = "survey"
 
 [exposures]
 files = {files}
-# ext = "SCI"             # of files with several images: all of this name
-# detector = "DETECTOR"   # keyword that tells detectors apart
-# group_by = ["FILTER"]   # keywords whose values keep fields apart
+{ext}ext = "{name}"             # of files with several images: all with it
+{detector}detector = "DETECTOR"   # keyword that tells detectors apart
+{filter}group_by = ["FILTER"]   # keywords whose values keep fields apart
 # overlap = 0.5           # share in common from which images are of one field
 # gain = 1.5              # and other options of how images are read
 
@@ -42,6 +42,8 @@ files = {files}
 """
 # So many exposures of a field are named in the plan.
 _NAMED = 6
+# Keywords of so many images are looked at for an example.
+_LOOKED_AT = 50
 
 
 def add(commands):
@@ -55,8 +57,8 @@ def add(commands):
     parser.add_argument('file', nargs='?', metavar='SURVEY.toml',
                         help='what to do')
     parser.add_argument('--init', metavar='FOLDER',
-                        help='write an example, survey.toml, for the images '
-                             'in a folder')
+                        help='write an example for the images in a folder '
+                             '(default: survey.toml)')
     parser.add_argument('--dry-run', action='store_true',
                         help='show the plan, and stop')
     parser.add_argument('--workers', type=tools.count, metavar='N',
@@ -69,8 +71,8 @@ def add(commands):
 
 def run(options):
     """Run the survey."""
-    if (options.file is None) == (options.init is None):
-        options.parser.error('either SURVEY.toml or --init must be given')
+    if options.file is None and options.init is None:
+        options.parser.error('SURVEY.toml or --init must be given')
     if options.init is not None:
         _write_example(options)
         return
@@ -95,15 +97,41 @@ def _write_example(options):
     if not images:
         msg = f'{folder}: must have images (*.fits, *.asdf), got none'
         raise ValueError(msg)
-    name = Path('survey.toml')
+    name = Path(options.file or 'survey.toml')
+    if name.exists():
+        msg = (f'{name} exists; give the example another name: mgauss survey '
+               'NAME.toml --init FOLDER')
+        raise FileExistsError(msg)
     tools.claim([name], overwrite=False)
+    if not folder.is_absolute():
+        folder = Path(os.path.relpath(folder, name.parent))
     endings = sorted({''.join(path.suffixes[-2:]) if path.suffix in
                       ('.gz', '.fz') else path.suffix for path in images})
     files = [f'{folder.as_posix()}/*{ending}' for ending in endings]
     with tools.whole_file(name) as draft:
-        draft.write_text(_EXAMPLE.format(files=str(files).replace("'", '"')),
-                         encoding='utf-8')
+        draft.write_text(_EXAMPLE.format(
+            files=str(files).replace("'", '"'), **_seen_in(images)),
+            encoding='utf-8')
     tools.say(options, f'{name} is written, for {len(images)} images')
+
+
+def _seen_in(images):
+    """Return what of an example is no comment, by what images have."""
+    from photutils_mgauss.cli.survey_plan import keyword_of
+    from photutils_mgauss.files.image_layers import science_images
+    some = images[::-(-len(images) // _LOOKED_AT)]
+    several = set()
+    for path in some:
+        labels = science_images(path)
+        names = {label.split(',')[0] for label in labels}
+        if len(labels) > len(names) == 1:
+            several |= names
+    values = {key: {keyword_of(path, key) for path in some}
+              for key in ('DETECTOR', 'FILTER')}
+    return {'name': min(several, default='SCI'),
+            'ext': '' if several else '# ',
+            **{key.lower(): '' if len(found - {None}) > 1 else '# '
+               for key, found in values.items()}}
 
 
 def _kept(survey):

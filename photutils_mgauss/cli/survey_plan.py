@@ -1,4 +1,5 @@
 """What a survey file asks for: exposures, fields, and the commands to run."""
+import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -193,13 +194,19 @@ def _exposures(path, folder, wanted, reading):
         try:
             found.append(_exposure(file, ext, wanted, reading))
         except (OSError, ValueError) as error:
-            troubles.append(tools.sentence_of(error))
+            troubles.append(_as_keys(tools.sentence_of(error)))
     if troubles:
         msg = '; '.join(troubles[:_NAMED])
         if len(troubles) > _NAMED:
             msg += f'; and {len(troubles) - _NAMED} more'
         raise ValueError(msg)
     return found
+
+
+def _as_keys(sentence):
+    """Name the options of a sentence as a survey's file does."""
+    return re.sub('--([a-z-]+)', lambda found: found[1].replace('-', '_'),
+                  sentence)
 
 
 def _check_names(path, pairs):
@@ -263,16 +270,23 @@ def _exposure(file, ext, wanted, reading):
             Footprint(image.wcs, image.data.shape), image.data.size)
 
 
-def _keyword(file, key):
-    """Return the value of a keyword, from whichever header has it."""
+def keyword_of(file, key):
+    """Return the value of a keyword, from whichever header has it, or None."""
     from photutils_mgauss.files.image_layers import is_asdf, open_fits
     if not is_asdf(file):
         with open_fits(file) as hdus:
             for hdu in hdus:
                 if key in hdu.header:
                     return str(hdu.header[key])
-    msg = f'must have the keyword {key}, which keeps exposures apart'
-    raise ValueError(msg)
+    return None
+
+
+def _keyword(file, key):
+    value = keyword_of(file, key)
+    if value is None:
+        msg = f'must have the keyword {key}, which keeps exposures apart'
+        raise ValueError(msg)
+    return value
 
 
 def _check_archive(path, exposures, archive, what):

@@ -1,9 +1,12 @@
 """The stars of one crowded field in many images: from images to the table."""
+import warnings
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from astropy.utils.exceptions import AstropyUserWarning
 
+from photutils_mgauss.crowded.correlated import allow_in_each
 from photutils_mgauss.crowded.many_equations import FARTHEST, reach_of
 from photutils_mgauss.crowded.many_plan import ManyPlan
 from photutils_mgauss.crowded.many_table import as_qtable, no_stars
@@ -18,6 +21,7 @@ from photutils_mgauss.photometry.many_images import (
 )
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.checkpoint import Checkpoint
+from photutils_mgauss.utils.correlated_noise import correlation_of, no_pairs
 
 
 class Settings(NamedTuple):
@@ -105,6 +109,12 @@ def _table(plan, outcomes, field):
     n_pixels = sum(outcome.n_pixels for outcome in done)
     meta = {'n_stars': len(stars), 'scales': plan.scales,
             'reduced_chi2': sum(one.chi2 for one in done) / max(n_pixels, 1)}
+    correlations = [correlation_of(sum((
+        one.pairs[k] for one in done if one.pairs.ndim > 3), no_pairs()))
+        for k in range(len(plan.images))]
+    stars = allow_in_each(stars, correlations, plan.psfs, plan.options.keep)
+    meta['noise_correlation'] = [str(one or '') for one in correlations]
+    _tell_of(correlations)
     if plan.given is not None:
         stars = _in_given_order(stars, plan.given)
     else:
@@ -120,6 +130,18 @@ def _table(plan, outcomes, field):
     if plan.factors.shape[2] > 2:
         add_motions(table, plan.grid, *place, rate, field.years.mean())
     return table
+
+
+def _tell_of(correlations):
+    """Warn of images with correlated noise."""
+    numbers = [k for k, one in enumerate(correlations) if one is not None]
+    if numbers:
+        warnings.warn(
+            f'In {len(numbers)} of {len(correlations)} images, the first is '
+            f'image {numbers[0]}: {correlations[numbers[0]]} Errors are '
+            'enlarged and significances reduced for it: stars of a '
+            'significance below the threshold may be noise.',
+            AstropyUserWarning, stacklevel=5)
 
 
 def _in_given_order(stars, given):

@@ -3,6 +3,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from photutils_mgauss.crowded.correlated import noise_pairs
 from photutils_mgauss.crowded.many_search import image_scales
 from photutils_mgauss.crowded.many_solve import solve_many
 from photutils_mgauss.crowded.many_table import no_stars, tabulate
@@ -19,6 +20,7 @@ from photutils_mgauss.crowded.plan import (
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.crowded.tile import CELL, TileJob, TileOptions
 from photutils_mgauss.utils.checkpoint import Checkpoint
+from photutils_mgauss.utils.correlated_noise import no_pairs
 
 # From so many images on tiles are smaller, down to the least side [pix].
 _IMAGES, _LEAST_SIDE = 4, 1024
@@ -33,9 +35,11 @@ def outcome_of(job):
     tile = solve_many(job)
     chi2 = sum(float((one.weight * one.residual**2).sum())
                for one in tile.models)
+    pairs = np.stack([no_pairs()] * job.n_images)
+    pairs[job.images] = [noise_pairs(model) for model in tile.models]
     return Outcome(tabulate(tile), chi2,
                    int(sum(one.good.sum() for one in tile.models)),
-                   np.concatenate(tile.widths))
+                   np.concatenate(tile.widths), pairs)
 
 
 @dataclass(frozen=True)

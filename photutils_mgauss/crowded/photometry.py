@@ -5,25 +5,18 @@ Every star is fitted with its neighbours free, in an image of which all other
 stars are subtracted, as Sec. 5 of Nie et al. asks of a method for the
 Galactic bulge.
 """
-import warnings
-
 import numpy as np
-from astropy.utils.exceptions import AstropyUserWarning
 
-from photutils_mgauss.crowded.plan import Plan, run
+from photutils_mgauss.crowded.correlated import growths
+from photutils_mgauss.crowded.plan import Plan
 from photutils_mgauss.crowded.residual import (
     nearest_background,
     without_residual,
 )
+from photutils_mgauss.crowded.solved import Solved
 from photutils_mgauss.crowded.stars import Stars
-from photutils_mgauss.crowded.table import (
-    as_qtable,
-    in_given_order,
-    no_stars,
-    positions,
-)
+from photutils_mgauss.crowded.table import positions
 from photutils_mgauss.crowded.tile import TileOptions
-from photutils_mgauss.crowded.unfinished import Solved
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.psf.star_errors import add_psf_errors
@@ -38,13 +31,11 @@ from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['CrowdedMixturePhotometry']
 
-# A PSF whose size is off by more than this fraction is warned of.
-_WIDTH_TOLERANCE = 0.1
-_CONFUSION = ('errors and fluxes allow for stars that were not found; what of '
-              'their light the background takes is calibrated on simulated '
-              'fields')
 # Stars are drawn out to where this fraction of the noise is left of them.
 _FAINTEST = 1e-3
+# Stars are looked for again if correlated noise makes the variance of fluxes
+# larger than this.
+_LITTLE = 1.1
 
 
 class CrowdedMixturePhotometry:
@@ -119,6 +110,13 @@ class CrowdedMixturePhotometry:
         Whether errors and fluxes allow for stars that are too faint or too
         close to others to be found, in the number that the stars around tell.
         Not where ``find_neighbors`` is False: then a list has all stars.
+    correlated_noise : bool, optional
+        Whether to look, where the light of stars is faint, if the noise of
+        neighbouring pixels is correlated, as in resampled images. If so, a
+        warning and ``meta['noise_correlation']`` of the table tell it,
+        errors are enlarged for it, and stars are looked for again, in twice
+        the time, with ``threshold``, ``keep`` and ``depth`` in units of these
+        errors. Only used with ``error``.
     saturation : float or `~astropy.units.Quantity`, optional
         The level from which pixels are saturated, in the unit of the data.
         If given, such pixels are masked, with the trails along rows and
@@ -209,8 +207,8 @@ class CrowdedMixturePhotometry:
                  effective_gain=None, maxiters=3, tile_shape=None,
                  overlap=128, executor=None, progress_bar=False,
                  find_neighbors=True, xy_bounds=1.0, checkpoint=None,
-                 psf_errors=True, confusion=True, saturation=None,
-                 residual_radius=None):
+                 psf_errors=True, confusion=True, correlated_noise=True,
+                 saturation=None, residual_radius=None):
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
         self.keep = as_real(keep, 'keep', minimum=0)
@@ -245,6 +243,7 @@ class CrowdedMixturePhotometry:
         self._noise = np.inf
         self.psf_errors = bool(psf_errors)
         self.confusion = bool(confusion)
+        self.correlated_noise = bool(correlated_noise)
         self.saturation = as_saturation(saturation)
         self.psf_used = psf_model
         self._psf = None if psf_model is None else LocalPSF.of(psf_model)
@@ -314,15 +313,20 @@ class CrowdedMixturePhotometry:
         return solved.table
 
     def _solve(self, image, psf, options, given):
-        """Return the `Solved` image."""
+        """Return the `Solved` image, deep as its noise allows."""
+        solved = self._solve_once(image, psf, options, given)
+        growth = growths(solved.correlation, psf)[0]
+        if growth > _LITTLE and self.find_neighbors and not solved.unfinished:
+            # What correlated noise makes of itself was taken for stars.
+            solved = self._solve_once(image, psf, options.less_deep(
+                np.sqrt(growth)), given)
+        solved.tell_of_correlation(stacklevel=4)
+        return solved
+
+    def _solve_once(self, image, psf, options, given):
         plan = Plan(image, psf, options, self.tile_shape, self.overlap,
                     given, self._checkpoint)
-        outcomes, errors = run(plan, self.executor, self.progress_bar)
-        unfinished = [core for core, outcome in zip(plan.cores, outcomes,
-                                                    strict=True)
-                      if outcome is None]
-        return Solved(self._table(outcomes, given, image.unit), unfinished,
-                      errors)
+        return Solved.of(plan, self.executor, self.progress_bar, stacklevel=5)
 
     def fit_images(self, images, stars=None, *, motions=False):
         """
@@ -442,7 +446,7 @@ class CrowdedMixturePhotometry:
             'count_slope', 'background_size', 'maxiters', 'tile_shape',
             'overlap', 'executor', 'checkpoint', 'saturation')}
         return type(self)(psf_model, psf_errors=False, confusion=False,
-                          **same | changes)
+                          correlated_noise=False, **same | changes)
 
     def _listed(self, init_params, unit):
         x, y, flux, number = _given(init_params, unit)
@@ -470,38 +474,8 @@ class CrowdedMixturePhotometry:
             max_rounds=self.maxiters, find_neighbors=self.find_neighbors,
             xy_bounds=self._bound,
             depth=self.depth, count_slope=self.count_slope,
-            confusion=self.confusion)
-
-    def _table(self, outcomes, given, unit):
-        """Put the stars of the tiles together; empties the list."""
-        done = [outcome for outcome in outcomes if outcome is not None]
-        outcomes.clear()
-        stars = Stars.joined([no_stars(),
-                              *(outcome.stars for outcome in done)])
-        meta = self._report(done, stars)
-        del done
-        if given is not None:
-            stars = in_given_order(stars, given)
-        else:
-            stars.sort('y', 'x')
-        if self.confusion:
-            meta['confusion'] = _CONFUSION
-        return as_qtable(stars, unit, meta, confusion=self.confusion)
-
-    def _report(self, done, stars):
-        widths = np.concatenate([o.widths for o in done]) if done else []
-        n_pixels = sum(o.n_pixels for o in done)
-        chi2 = sum(o.chi2 for o in done) / max(n_pixels, 1)
-        # Undetected companions broaden stars: look at those least broadened.
-        width = (float(np.percentile(widths, 25)) if len(widths) >= 5
-                 else np.nan)
-        if abs(width) > _WIDTH_TOLERANCE:
-            word = 'narrow' if width > 0 else 'wide'
-            warnings.warn(f'the PSF is too {word}: the variance of the light '
-                          f'of bright stars differs by {width:+.0%}',
-                          AstropyUserWarning, stacklevel=5)
-        return {'n_stars': len(stars), 'reduced_chi2': chi2,
-                'psf_size_difference': width}
+            confusion=self.confusion,
+            correlated_noise=self.correlated_noise and not image.estimated)
 
     def decode_flags(self, *, return_bit_values=False):
         """

@@ -4,17 +4,21 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from photutils_mgauss.crowded.correlated import noise_pairs
 from photutils_mgauss.crowded.solve import solve_tile
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.crowded.table import no_stars, tabulate
 from photutils_mgauss.crowded.tile import CELL, TileJob, TileOptions
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.checkpoint import Checkpoint, digest_of
+from photutils_mgauss.utils.correlated_noise import no_pairs
 from photutils_mgauss.utils.image import PixelData
 from photutils_mgauss.utils.parallel import Threads, tell
 
 # The smallest and the largest size of tiles if none is given [pix].
 _TILES = (1024, 2048)
+# Pixels this far off the model are counted [standard deviations].
+_FAR = 5.0
 
 
 @dataclass(frozen=True)
@@ -25,6 +29,8 @@ class Outcome:
     chi2: float = 0.0
     n_pixels: int = 0
     widths: np.ndarray = field(default_factory=lambda: np.empty(0))
+    pairs: np.ndarray = field(default_factory=no_pairs)
+    n_far: int = 0
 
     @classmethod
     def of(cls, job):
@@ -33,22 +39,25 @@ class Outcome:
             return cls(no_stars())
         tile = solve_tile(job)
         model = tile.model
-        chi = model.weight * model.residual**2
-        return cls(tabulate(tile, job.core), float(chi.sum()),
-                   int(model.good.sum()), tile.widths)
+        chi2 = model.weight * model.residual**2
+        return cls(tabulate(tile, job.core), float(chi2.sum()),
+                   int(model.good.sum()), tile.widths, noise_pairs(model),
+                   int((chi2 > _FAR**2).sum()))
 
     @classmethod
     def of_arrays(cls, arrays):
         """Return what `arrays` made arrays of."""
-        widths = arrays.pop('tile_widths')
-        chi2, n_pixels = arrays.pop('tile_sums')
+        widths, pairs = arrays.pop('tile_widths'), arrays.pop('tile_pairs')
+        chi2, n_pixels, n_far = arrays.pop('tile_sums')
         return cls(Stars.of_columns(arrays), float(chi2), int(n_pixels),
-                   widths)
+                   widths, pairs, int(n_far))
 
     def arrays(self):
         """Return all there is as a dict of arrays."""
         return {**vars(self.stars), 'tile_widths': self.widths,
-                'tile_sums': np.array([self.chi2, self.n_pixels], float)}
+                'tile_pairs': self.pairs,
+                'tile_sums': np.array([self.chi2, self.n_pixels, self.n_far],
+                                      float)}
 
 
 class Tiles:

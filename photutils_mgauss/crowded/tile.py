@@ -1,5 +1,5 @@
 """One tile of a crowded image while it is being solved."""
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,11 +36,19 @@ class TileOptions:
     depth: float = np.inf
     count_slope: float = 0.0
     confusion: bool = False
+    correlated_noise: bool = False
+    raised: float = 1.0
 
     @property
     def faintest(self):
         """The significance from which stars are fitted, reported or not."""
         return min(self.depth, self.threshold)
+
+    def less_deep(self, factor):
+        """Return options with limits that are raised by a factor."""
+        return replace(self, threshold=factor * self.threshold,
+                       keep=factor * self.keep, depth=factor * self.depth,
+                       raised=factor * self.raised)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,4 @@
 """What is raised when not all of an image could be solved."""
-from dataclasses import dataclass
-
-from astropy.table import QTable
 
 
 class UnfinishedTilesError(RuntimeError):
@@ -48,18 +45,3 @@ class UnfinishedTilesError(RuntimeError):
         return (f'{len(self.unfinished)} tiles were not finished, at (y_low, '
                 f'y_high, x_low, x_high) = {self.unfinished}; the stars of '
                 f'the others are in the attribute table')
-
-
-@dataclass(frozen=True)
-class Solved:
-    """The stars of an image, what is unfinished of it, and why."""
-
-    table: QTable
-    unfinished: list
-    errors: list
-
-    def check(self):
-        """Raise an error if not all is finished."""
-        if self.unfinished:
-            raise UnfinishedTilesError(self.unfinished,
-                                       self.table) from self.errors[0]

@@ -75,16 +75,27 @@ class NoiseCorrelation:
             correlations times the overlap of the star's derivative with
             itself at each distance.
         """
-        steps = np.arange(-_REACH, _REACH + 1)
-        square = (steps**2 + steps[:, None]**2) / (4 * width**2)
-        overlap = (1 - square) * np.exp(-square)
+        square = _squared_distances(width)
+        return self._sum((1 - square) * np.exp(-square))
+
+    def flux_growth(self, width):
+        """Return by how much the variance of a star's flux grows."""
+        return self._sum(np.exp(-_squared_distances(width)))
+
+    def _sum(self, overlap):
         return max(1.0, float((self.matrix * overlap).sum()))
 
     def __str__(self):
         along_x, along_y = self.nearest
         return ('The noise of neighbouring pixels is correlated, as in '
                 f'resampled images: by {along_x:.2f} along x and '
-                f'{along_y:.2f} along y, measured on blank sky.')
+                f'{along_y:.2f} along y, where there is little light.')
+
+
+def _squared_distances(width):
+    """Return those of the matrix in units of twice a width."""
+    steps = np.arange(-_REACH, _REACH + 1)
+    return (steps**2 + steps[:, None]**2) / (4 * width**2)
 
 
 def noise_correlation(data, error, mask, x, y, margin):
@@ -120,11 +131,41 @@ def noise_correlation(data, error, mask, x, y, margin):
 
 def _in_squares(image, stars, number, side):
     """Return the correlation in some squares, or None."""
-    size = 2 * _REACH + 1
-    products, pairs = np.zeros((size, size)), np.zeros((size, size))
-    for rows, columns in _squares(image[0].shape, number, side):
-        _add_products(_blank_pulls(image, rows, columns, *stars), products,
-                      pairs)
+    sums = no_pairs()
+    for window in _squares(image[0].shape, number, side):
+        sums += _pairs(*_blank(image, *window, *stars))
+    return correlation_of(sums)
+
+
+def no_pairs():
+    """Return the sums (2, 2 m + 1, 2 m + 1) of no pixels."""
+    return np.zeros((2, 2 * _REACH + 1, 2 * _REACH + 1))
+
+
+def residual_pairs(pulls, blank):
+    """
+    Sum the products of pairs of pixels of a residual.
+
+    Parameters
+    ----------
+    pulls : (ny, nx) `~numpy.ndarray`
+        The residual over its errors.
+    blank : (ny, nx) `~numpy.ndarray` of bool
+        Where it may be taken for noise.
+
+    Returns
+    -------
+    (2, 2 m + 1, 2 m + 1) `~numpy.ndarray`
+        The sums of products at each distance (y, x), and how many there are:
+        sums of several images can be added.
+    """
+    return sum((_pairs(pulls[window], blank[window])
+                for window in _squares(pulls.shape, *_ALL)), no_pairs())
+
+
+def correlation_of(sums):
+    """Return the `NoiseCorrelation` of sums of pairs if it is significant."""
+    products, pairs = sums
     if pairs.min() < _FEWEST_PAIRS:
         return None
     matrix = np.divide(products, pairs, where=pairs > 0,
@@ -162,8 +203,8 @@ def _squares(shape, number, side):
             for row in starts[0] for column in starts[1]]
 
 
-def _blank_pulls(image, rows, columns, x, y, margin):
-    """Return data over errors of blank pixels less their median, else NaN."""
+def _blank(image, rows, columns, x, y, margin):
+    """Return data over errors, and where no known star is."""
     data, error = (array[rows, columns] for array in image[:2])
     with np.errstate(invalid='ignore', divide='ignore'):
         pulls = data / error
@@ -181,6 +222,16 @@ def _blank_pulls(image, rows, columns, x, y, margin):
         box = tuple(slice(max(int(np.ceil(at - margin)), 0),
                           max(int(at + margin) + 1, 0)) for at in (y_0, x_0))
         usable[box] = False
+    return pulls, usable
+
+
+def _pairs(pulls, usable):
+    """Return the sums of pairs of pixels without light."""
+    return _products(_noise_alone(pulls, usable))
+
+
+def _noise_alone(pulls, usable):
+    """Return pulls less their mean, NaN where there is light."""
     pulls = np.where(usable, pulls, 0)
     pulls -= np.median(pulls[usable]) if usable.any() else 0
     for side in _SIDES:
@@ -188,13 +239,14 @@ def _blank_pulls(image, rows, columns, x, y, margin):
             break
         mean = uniform_filter(pulls, side)
         light = usable & (np.abs(mean) > _LIGHT * mad_std(mean[usable]))
-        usable &= ~binary_dilation(light, iterations=2 + side // 2)
+        usable = usable & ~binary_dilation(light, iterations=2 + side // 2)
     pulls[~usable] = np.nan
     return pulls - np.mean(pulls[usable]) if usable.any() else pulls
 
 
-def _add_products(pulls, products, pairs):
-    """Add the products of all pairs of pixels, and how many there are."""
+def _products(pulls):
+    """Return the products of all pairs of pixels, and how many there are."""
+    products, pairs = sums = no_pairs()
     good = np.isfinite(pulls)
     values = np.where(good, pulls, 0)
     good = good.astype(float)
@@ -212,3 +264,4 @@ def _add_products(pulls, products, pairs):
                 total[_REACH + dy, _REACH + dx] += found
                 if dy or dx:
                     total[_REACH - dy, _REACH - dx] += found
+    return sums

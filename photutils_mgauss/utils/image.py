@@ -51,12 +51,15 @@ class PixelData:
         Of the same shape, True for pixels to leave out.
     unit : `~astropy.units.UnitBase` or None
         Of the data.
+    estimated : bool
+        Whether the error is one number that was made from the data.
     """
 
     data: np.ndarray
     error: np.ndarray | None
     mask: np.ndarray | None
     unit: object = None
+    estimated: bool = False
 
     @property
     def shape(self):
@@ -68,7 +71,8 @@ class PixelData:
         if self.error is not None:
             return self
         noise = _estimate_noise(self.data, self.mask)
-        return replace(self, error=np.broadcast_to(noise, self.shape))
+        return replace(self, error=np.broadcast_to(noise, self.shape),
+                       estimated=True)
 
     def part(self, window=np.s_[:, :]):
         """Return data and variance of a window, both 0 at bad pixels."""

@@ -189,13 +189,41 @@ def test_an_image_without_a_wcs_is_named_before_work_starts(tmp_path):
         read_survey(path)
 
 
+def test_the_example_knows_files_of_several_images(images, tmp_path,
+                                                   monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'raw').mkdir()
+    source = min((images / 'raw').glob('*.fits'))
+    data, header = fits.getdata(source), fits.getheader(source)
+    for name in ('a', 'b'):
+        chips = [fits.ImageHDU(data, header, name='SCI', ver=version)
+                 for version in (1, 2)]
+        fits.HDUList([fits.PrimaryHDU(header=fits.Header(
+            {'FILTER': f'F{name}'})), *chips]).writeto(
+                tmp_path / 'raw' / f'{name}.fits')
+    (tmp_path / 'plans').mkdir()
+    assert main(['survey', 'plans/mine.toml', '--init', 'raw']) == 0
+    text = (tmp_path / 'plans' / 'mine.toml').read_text()
+    assert '\next = "SCI"' in text
+    assert '\ngroup_by = ["FILTER"]' in text
+    assert '\n# detector' in text
+    survey = read_survey(tmp_path / 'plans' / 'mine.toml')
+    assert [one.name for one in survey.exposures] == [
+        'a_SCI1', 'a_SCI2', 'b_SCI1', 'b_SCI2']
+    (tmp_path / 'plans' / 'mine.toml').write_text(
+        text.replace('ext = "SCI"', ''))
+    assert main(['survey', 'plans/mine.toml', '--dry-run']) == 1
+    assert 'a.fits: ext must say which image' in capsys.readouterr().err
+
+
 def test_the_example_is_for_the_images_of_a_folder(images, tmp_path,
-                                                   monkeypatch):
+                                                   monkeypatch, capsys):
     monkeypatch.chdir(images)
     assert main(['survey', '--init', 'raw']) == 0
     try:
         assert len(read_survey(images / 'survey.toml').exposures) == 5
         assert main(['survey', '--init', 'raw']) == 1  # it is there already
+        assert 'give the example another name' in capsys.readouterr().err
     finally:
         (images / 'survey.toml').unlink()
 

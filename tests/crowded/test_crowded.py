@@ -695,6 +695,14 @@ def test_bad_keywords_are_named(keyword, value, error):
         photometry(**{keyword: value})
 
 
+@pytest.mark.parametrize(('sign', 'factor', 'sentence'), [
+    (-1, 1, 'PSF is too narrow'), (1, 1 / 4, 'do not describe the image')])
+def test_an_image_that_stars_do_not_describe_is_said(crowd, sign, factor,
+                                                     sentence):
+    with pytest.warns(AstropyUserWarning, match=sentence):
+        photometry(maxiters=1)(sign * crowd[0], error=factor * crowd[1])
+
+
 def test_bad_images_are_named():
     with pytest.raises(ValueError, match='data must have'):
         photometry()(np.ones(5))
