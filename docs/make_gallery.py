@@ -3,8 +3,8 @@ The gallery: a page and a thumbnail for every script in ``docs/gallery``.
 
 A script begins with a docstring, whose first line, without its full stop, is
 the title, and leaves its figure in the variable ``figure``, as wide as a
-column of a journal. It runs when the pages are built, and again only when it
-has changed.
+column of a journal or as two. It runs when the pages are built, and again
+only when it has changed.
 """
 import ast
 import runpy

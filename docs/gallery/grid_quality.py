@@ -4,8 +4,8 @@ How good a grid is.
 ePSFs with Airy rings, over a detector, turned into mixtures of three
 Gaussians: the error of the size at each node (as Figs. 4 to 7 of Nie et al.),
 the pixel-phase error, and the ellipticity as whiskers along the long axis.
-Beside them, for two, three and five Gaussians, what is left of the ePSF that
-is described worst: a pattern that one Gaussian could take up asks for more of
+Below, for two, three and five Gaussians, what is left of the ePSF that is
+described worst: a pattern that one Gaussian could take up asks for more of
 them.
 """
 import matplotlib.pyplot as plt
@@ -41,14 +41,17 @@ epsfs = GriddedPSFModel(NDData(
 psfs = {k: GriddedMixturePSF.from_gridded_psf(epsfs, n_components=k)
         for k in (2, 3, 5)}
 
-figure, axes = plt.subplots(3, 2, figsize=(3.5, 5.4), layout='constrained')
-maps, worst = axes.T
+figure, axes = plt.subplots(2, 3, figsize=(7.1, 3.4), layout='constrained')
+maps, worst = axes
 plot_node_map(psfs[3], 'size_error', ax=maps[0])
 plot_node_map(psfs[3], 'phase_error', ax=maps[1])
 plot_whiskers(psfs[3], ax=maps[2])
-for ax in maps:
-    ax.set_title(ax.get_title().partition(': ')[2].replace(', ', '\n'))
 for ax, (k, psf) in zip(worst, psfs.items(), strict=True):
     plot_worst_node(psf, epsfs, ax=ax)
-    node, _, size = ax.get_title().partition('), ')
-    ax.set_title(f'K = {k}, {node})\n{size}')
+    ax.set_title(f'K = {k}')
+maps[0].set_title('size')
+maps[1].set_title('pixel phase')
+bars = [ax for ax in figure.axes if ax not in axes]
+for bar, label in zip(bars, (r'$\delta(R^2)/R^2$', 'shift [pix]',
+                             *3 * ['% of the peak']), strict=True):
+    bar.set_ylabel(label)
