@@ -2,16 +2,20 @@
 The gallery: a page and a thumbnail for every script in ``docs/gallery``.
 
 A script begins with a docstring, whose first line, without its full stop, is
-the title, and leaves its figure in the variable ``figure``. It runs when the
-pages are built, and again only when it has changed.
+the title, and leaves its figure in the variable ``figure``, as wide as a
+column of a journal or as two. It runs when the pages are built, and again
+only when it has changed.
 """
 import ast
 import runpy
 import textwrap
 from pathlib import Path
 
-DPI = 100
+DPI = 200
 THUMBNAIL = 320  # pixels wide
+# Letters that can be read in a column of 88 mm, and lines to go with them.
+STYLE = {'font.size': 7.5, 'axes.titlesize': 8, 'legend.fontsize': 6.5,
+         'lines.linewidth': 1, 'lines.markersize': 4, 'axes.linewidth': 0.6}
 
 PAGE = """\
 {title}
@@ -89,7 +93,8 @@ def _draw(script, picture):
     import matplotlib as mpl
     mpl.use('Agg')
     import matplotlib.pyplot as plt
-    figure = runpy.run_path(str(script))['figure']
+    with plt.rc_context(STYLE):
+        figure = runpy.run_path(str(script))['figure']
     _check(figure, script)
     figure.savefig(picture, dpi=DPI)
     width = figure.get_size_inches()[0]

@@ -18,13 +18,15 @@ stars = photometry(scene.image, error=scene.error, mask=scene.mask)
 residual = photometry.make_residual_image(
     scene.image, include_local_bkg=True) / scene.error
 
-figure, axes = plt.subplots(1, 3, figsize=(12, 4), layout='constrained')
+figure, axes = plt.subplot_mosaic('AB;CC', figsize=(3.5, 4.4),
+                                  layout='constrained')
+axes = list(axes.values())
 light = np.arcsinh((scene.image - scene.background) / 10)
 for ax in axes[:2]:
     shown = ax.imshow(light, origin='lower', cmap='gray', vmin=-1, vmax=7)
 axes[1].plot(stars['x_fit'], stars['y_fit'], '.', color='#E69F00',
-             markersize=2.5)
-figure.colorbar(shown, ax=axes[:2], shrink=0.8,
+             markersize=0.8)
+figure.colorbar(shown, ax=axes[:2], shrink=0.8, location='bottom',
                 label='asinh(light / 10 electrons)')
 left = axes[2].imshow(residual, origin='lower', cmap='RdBu_r', vmin=-5,
                       vmax=5)

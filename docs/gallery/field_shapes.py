@@ -24,7 +24,7 @@ field = fit_mixture_field(data, stars, error=scene.error, mask=scene.mask,
 
 
 report = assess_psf(field, truth, (9, 9))
-figure, axes = plt.subplots(1, 2, figsize=(9, 4), layout='constrained')
+figure, axes = plt.subplots(2, 1, figsize=(3.5, 5.4), layout='constrained')
 for ax, name, label in (
         (axes[0], 'size_error', r'$\delta(R^2)/R^2$'),
         (axes[1], 'ellipticity_error', r'$\delta\epsilon$')):

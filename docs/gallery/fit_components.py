@@ -23,10 +23,12 @@ for axis in (0, 1):  # averaged over the pixel, four samples wide
     image = convolve1d(image, np.array([1, 2, 2, 2, 1]) / 8, axis)
 
 fit = fit_mixture(image, 3, oversampling=4)
-figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout='constrained')
+figure, axes = plt.subplots(3, 1, figsize=(3.5, 6.6), layout='constrained')
 plot_projection(fit, image, oversampling=4, ax=axes[0])
 plot_profile(fit, image, ax=axes[1])
 plot_ellipses(fit.mixture, ax=axes[2])
+axes[1].legend(loc='upper right')
+axes[2].legend(loc='center left', bbox_to_anchor=(1, 0.5))
 for ax, title in zip(axes, ('summed along y', 'the brightest row',
                             'one-sigma ellipses'), strict=True):
     ax.set_title(title)

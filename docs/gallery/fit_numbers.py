@@ -19,5 +19,5 @@ for axis in (0, 1):  # averaged over the pixel, four samples wide
     image = convolve1d(image, np.array([1, 2, 2, 2, 1]) / 8, axis)
 
 table = compare_n_components(image, (1, 2, 3, 4, 5), oversampling=4)
-figure, axes = plt.subplots(2, 3, figsize=(8, 5.6), layout='constrained')
+figure, axes = plt.subplots(3, 2, figsize=(3.5, 4.3), layout='constrained')
 plot_comparison_of_numbers(image, table, axes=axes)

@@ -18,7 +18,7 @@ image = truth.render((17, 17), 8, 8) + noise
 
 posterior = sample_mixture(image, 2, draws=300, tune=300, chains=2,
                            rng=1)
-figure, axes = plt.subplots(2, 2, figsize=(9, 5.6), layout='constrained')
+figure, axes = plt.subplots(2, 2, figsize=(3.5, 4), layout='constrained')
 for row, name in zip(axes, ('weights', 'stddevs'), strict=True):
     plot_posterior(posterior, name, ax=row[0])
     plot_trace(posterior, name, ax=row[1])

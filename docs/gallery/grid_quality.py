@@ -41,13 +41,17 @@ epsfs = GriddedPSFModel(NDData(
 psfs = {k: GriddedMixturePSF.from_gridded_psf(epsfs, n_components=k)
         for k in (2, 3, 5)}
 
-figure, axes = plt.subplots(2, 3, figsize=(13, 7.4), layout='constrained')
+figure, axes = plt.subplots(2, 3, figsize=(7.1, 3.4), layout='constrained')
 maps, worst = axes
 plot_node_map(psfs[3], 'size_error', ax=maps[0])
 plot_node_map(psfs[3], 'phase_error', ax=maps[1])
 plot_whiskers(psfs[3], ax=maps[2])
-for ax in maps:
-    ax.set_title(ax.get_title().replace(': ', '\n'), fontsize='medium')
 for ax, (k, psf) in zip(worst, psfs.items(), strict=True):
     plot_worst_node(psf, epsfs, ax=ax)
-    ax.set_title(f'K = {k}\n{ax.get_title()}', fontsize='medium')
+    ax.set_title(f'K = {k}')
+maps[0].set_title('size')
+maps[1].set_title('pixel phase')
+bars = [ax for ax in figure.axes if ax not in axes]
+for bar, label in zip(bars, (r'$\delta(R^2)/R^2$', 'shift [pix]',
+                             *3 * ['% of the peak']), strict=True):
+    bar.set_ylabel(label)

@@ -17,7 +17,7 @@ fitter = ProperMotionFitter(references=list(quasars))
 solution = fitter.fit(epochs)
 
 stars = solution.stars
-figure, axes = plt.subplots(1, 2, figsize=(9.5, 4.4), layout='constrained')
+figure, axes = plt.subplots(2, 1, figsize=(3.5, 5.8), layout='constrained')
 plot_proper_motions(stars, ax=axes[0])
 row = {name: i for i, name in enumerate(sources['id'])}
 true = sources[[row[name] for name in stars['id']]]

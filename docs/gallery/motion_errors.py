@@ -23,7 +23,7 @@ campaigns = ((0, 6), (0, 3, 6), (0, 1, 3, 6), (0, 1, 3, 5, 6),
 solutions = [fitter.fit([epochs[i] for i in campaign])
              for campaign in campaigns]
 
-figure, axes = plt.subplots(1, 2, figsize=(9.5, 4), layout='constrained')
+figure, axes = plt.subplots(2, 1, figsize=(3.5, 5), layout='constrained')
 stars = solutions[-1].stars
 magnitude = dict(zip(sources['id'], sources['mag_g'].value, strict=True))
 plot_motion_errors(stars,

@@ -30,7 +30,7 @@ for one, exposure in zip(simulate_catalogues(
     epochs.append(Epoch(one.table, naive.wcs(camera.shape, 0.074), one.time))
 quasars = list(sources['id'][sources['kind'] == 'qso'])
 
-figure, axes = plt.subplots(1, 2, figsize=(10, 4.6), layout='constrained')
+figure, axes = plt.subplots(2, 1, figsize=(3.5, 6.4), layout='constrained')
 for ax, transform in zip(axes, ('shift', 'poly-3'), strict=True):
     solution = ProperMotionFitter(
         transform=transform, references=quasars, systematic=None,

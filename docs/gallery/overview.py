@@ -42,7 +42,10 @@ quasars = sources[sources['kind'] == 'qso']['ra', 'dec']
 quasars['class'] = 'qso'
 solution = ProperMotionFitter(references=quasars).fit(epochs)
 
-figure, axes = plt.subplots(1, 3, figsize=(12, 3.7), layout='constrained')
+figure, axes = plt.subplot_mosaic('AB;CC', figsize=(3.5, 4),
+                                  height_ratios=(1, 1.9),
+                                  layout='constrained')
+axes = list(axes.values())
 axes[0].imshow(np.arcsinh(data / 30), origin='lower', cmap='gray_r')
 axes[0].set(title='an image', xlabel='x [pix]', ylabel='y [pix]')
 plot_mixture(field.mixture_at(225, 225), ax=axes[1])

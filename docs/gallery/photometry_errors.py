@@ -28,6 +28,6 @@ mas = 1e3 * Instrument().pixel_scale
 residuals = mas * np.column_stack([table[f'{c}_fit'] - stars[c].value
                                    for c in 'xy'])
 errors = mas * np.column_stack([table[f'{c}_err'] for c in 'xy'])
-figure, ax = plt.subplots(figsize=(6, 4.2), layout='constrained')
+figure, ax = plt.subplots(figsize=(3.5, 2.7), layout='constrained')
 plot_error_curve(stars['mag'].value, residuals, errors, unit='mas', ax=ax)
 ax.set_ylim(bottom=0.01)

@@ -32,8 +32,8 @@ error = np.sqrt(image + 25)
 image += rng.normal(0, error)
 one = fit_mixture(psf.render((81, 81), 40, 40), 1, radius=3).mixture
 
-figure, axes = plt.subplots(1, 2, figsize=(10, 3.8), layout='constrained',
-                            sharey=True)
+figure, axes = plt.subplots(2, 1, figsize=(3.5, 4), layout='constrained',
+                            sharex=True, sharey=True)
 start = QTable({'x': x, 'y': y, 'flux': np.full(400, 1e5)})
 for ax, mixture, title in ((axes[0], psf, 'the true PSF'),
                            (axes[1], one, 'one Gaussian')):

@@ -8,6 +8,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from photutils_mgauss.cli import tools
+from photutils_mgauss.utils.waiting import waiting
 
 _EXAMPLE = """\
 # What mgauss survey does. Names are relative to the folder of this file.
@@ -221,7 +222,9 @@ def _do(options, tasks, workers, what):
     if not tasks:
         return {}
     hidden = options.quiet or not sys.stderr.isatty()
-    with tqdm(total=len(tasks), desc=what, disable=hidden) as bar:
+    # Within a task nothing is shown beside the bar.
+    with waiting(what, progress_bar=True), tqdm(
+            total=len(tasks), desc=what, disable=hidden) as bar:
         def tell(outcome):
             bar.update()
             if outcome.error:

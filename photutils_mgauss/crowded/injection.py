@@ -17,6 +17,7 @@ from photutils_mgauss.utils.validation import (
     as_real,
     as_rng,
 )
+from photutils_mgauss.utils.waiting import waiting
 
 # Artificial stars are drawn out to where this fraction of the smallest noise
 # is left of them.
@@ -135,20 +136,22 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     separation = as_real(separation, 'separation', minimum=5)
     radius = as_real(radius, 'radius', above=0)
     flux_ratio = as_real(flux_ratio, 'flux_ratio', above=1)
-    before = photometry(data, mask=mask, error=error)
-    known = positions(before)
-    renderer = MixtureRenderer(photometry.psf_used)
-    faintest = _FAINTEST * np.sqrt(variance[variance > 0].min(initial=np.inf))
-    tables = []
-    for _ in range(repeats):
-        true = _artificial(variance, flux, separation, rng)
-        light = renderer.image(np.array(true), faintest, image.shape)
-        noisy = rng.poisson(np.maximum(light, 0) * gain) / gain
-        table = photometry(image + noisy, mask=variance == 0,
-                           error=np.sqrt(variance + light / gain))
-        row = match(true, positions(table), known, radius, flux_ratio)
-        tables.append(_injected(true, table, row))
-    photometry.results = before
+    with waiting('inject_and_recover'):
+        before = photometry(data, mask=mask, error=error)
+        known = positions(before)
+        renderer = MixtureRenderer(photometry.psf_used)
+        faintest = _FAINTEST * np.sqrt(
+            variance[variance > 0].min(initial=np.inf))
+        tables = []
+        for _ in range(repeats):
+            true = _artificial(variance, flux, separation, rng)
+            light = renderer.image(np.array(true), faintest, image.shape)
+            noisy = rng.poisson(np.maximum(light, 0) * gain) / gain
+            table = photometry(image + noisy, mask=variance == 0,
+                               error=np.sqrt(variance + light / gain))
+            row = match(true, positions(table), known, radius, flux_ratio)
+            tables.append(_injected(true, table, row))
+        photometry.results = before
     stars = vstack(tables)
     if flux_edges is None:
         flux_edges = _flux_edges(np.asarray(stars['flux_true']))

@@ -8,6 +8,7 @@ from photutils_mgauss.utils.image import read_pixels
 from photutils_mgauss.utils.saturation import as_saturation, without_saturated
 from photutils_mgauss.utils.star_columns import read_sources
 from photutils_mgauss.utils.validation import as_integer, as_real
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['fit_crowded_psf']
 
@@ -134,4 +135,5 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
     photometry = CrowdedMixturePhotometry(
         None, effective_gain=effective_gain, background_size=background_size,
         executor=executor, checkpoint=checkpoint)
-    return photometry.fit_field(image, options)[0]
+    with waiting('fit_crowded_psf', progress_bar):
+        return photometry.fit_field(image, options)[0]

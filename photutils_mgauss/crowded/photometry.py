@@ -27,6 +27,7 @@ from photutils_mgauss.utils.per_thread import PerThread, keep
 from photutils_mgauss.utils.saturation import as_saturation, without_saturated
 from photutils_mgauss.utils.star_columns import read_sources
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['CrowdedMixturePhotometry']
 
@@ -289,22 +290,23 @@ class CrowdedMixturePhotometry:
         UnfinishedTilesError
             If a worker failed; the finished tiles are in the error.
         """
-        image = without_saturated(read_pixels(data, error, mask),
-                                  self.saturation).with_error()
-        given = (None if init_params is None
-                 else self._listed(init_params, image.unit))
-        psf = self._psf_of(image)
-        options = self._options(image)
-        solved = self._solve(image, psf, options, given)
-        known = None
-        if self.residual_radius is not None and not solved.unfinished:
-            image, known = without_residual(
-                image, self.psf_used, solved.table, self.residual_radius)
-            if known is not None:
-                solved = self._solve(image, psf, options, given)
-        if self.psf_errors:
-            add_psf_errors(solved.table, image, self.psf_used,
-                           executor=self.executor)
+        with waiting('CrowdedMixturePhotometry', self.progress_bar):
+            image = without_saturated(read_pixels(data, error, mask),
+                                      self.saturation).with_error()
+            given = (None if init_params is None
+                     else self._listed(init_params, image.unit))
+            psf = self._psf_of(image)
+            options = self._options(image)
+            solved = self._solve(image, psf, options, given)
+            known = None
+            if self.residual_radius is not None and not solved.unfinished:
+                image, known = without_residual(
+                    image, self.psf_used, solved.table, self.residual_radius)
+                if known is not None:
+                    solved = self._solve(image, psf, options, given)
+            if self.psf_errors:
+                add_psf_errors(solved.table, image, self.psf_used,
+                               executor=self.executor)
         keep(self, results=solved.table, psf_residual=known,
              _noise=options.noise)
         solved.check()
@@ -395,10 +397,12 @@ class CrowdedMixturePhotometry:
                    f'{self.residual_radius:g}')
             raise ValueError(msg)
         from photutils_mgauss.crowded.many_images import Settings, fit_images
-        table, unfinished, errors = fit_images(images, stars, Settings(
-            self._options, self._model_of, self._bound, self.tile_shape,
-            self.overlap, self.executor, self.progress_bar,
-            self._checkpoint, self.saturation), motions=motions)
+        with waiting('CrowdedMixturePhotometry.fit_images',
+                     self.progress_bar):
+            table, unfinished, errors = fit_images(images, stars, Settings(
+                self._options, self._model_of, self._bound, self.tile_shape,
+                self.overlap, self.executor, self.progress_bar,
+                self._checkpoint, self.saturation), motions=motions)
         Solved(table, unfinished, errors).check()
         return table
 

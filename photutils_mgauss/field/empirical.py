@@ -26,6 +26,7 @@ from photutils_mgauss.field.input import normalised, read_sample
 from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['EmpiricalPSF']
 
@@ -121,15 +122,16 @@ class EmpiricalPSF(ComparedByValue):
             If an argument is not valid or no star can be used.
         """
         oversampling = as_integer(oversampling, 'oversampling', minimum=1)
-        field = fit_mixture_field(
-            data, stars, error=error, mask=mask, n_components=n_components,
-            degree=degree, radius=radius, normalise='stamps',
-            brighter_fatter=False,
-            executor=executor)
-        problem = _Lattice.of(field, oversampling)
-        target, weights = _corrections(field, read_sample(
-            data, stars, error, mask, field.radius, None).stamps)
-        coefficients = problem.solve(field, target, weights)
+        with waiting('EmpiricalPSF.from_stars'):
+            field = fit_mixture_field(
+                data, stars, error=error, mask=mask, n_components=n_components,
+                degree=degree, radius=radius, normalise='stamps',
+                brighter_fatter=False,
+                executor=executor)
+            problem = _Lattice.of(field, oversampling)
+            target, weights = _corrections(field, read_sample(
+                data, stars, error, mask, field.radius, None).stamps)
+            coefficients = problem.solve(field, target, weights)
         return cls(field, coefficients, field.degree, oversampling)
 
     def image_at(self, x, y, *, oversampling=None):

@@ -47,6 +47,7 @@ from photutils_mgauss.field.options import FieldOptions
 from photutils_mgauss.field.pixel import chosen_pixel, warn_of_phase
 from photutils_mgauss.field.progress import progress
 from photutils_mgauss.field.tuned_field import TunedMixtureField, known_shapes
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['fit_mixture_field']
 
@@ -210,22 +211,23 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         regularization, start, centre, normalise, pixel_integrated,
         correlated_noise, contexts, brighter_fatter)
     given = data, stars, error, mask
-    sample, radius = _read(given, options)
-    if options.correlated_noise:
-        allow_for_correlation(sample)
-    n_components, degree = options.size(len(sample.row))
-    top = possible_degree(degree, len(sample.row))
-    problem = sample.problem(top, options.local_bkg)
-    with Workers(executor) as workers, progress(workers, progress_bar):
-        if start is not None:
-            return _tuned_field(problem, sample, radius, top, options,
-                                workers)
-        field = _free_field(problem, sample, radius, n_components, degree,
-                            top, options, workers)
-    if options.normalise == 'stamps':
-        return field
-    return _with_wings(field, sample, read_exposures(*given),
-                       options.normalise)
+    with waiting('fit_mixture_field', progress_bar):
+        sample, radius = _read(given, options)
+        if options.correlated_noise:
+            allow_for_correlation(sample)
+        n_components, degree = options.size(len(sample.row))
+        top = possible_degree(degree, len(sample.row))
+        problem = sample.problem(top, options.local_bkg)
+        with Workers(executor) as workers, progress(workers, progress_bar):
+            if start is not None:
+                return _tuned_field(problem, sample, radius, top, options,
+                                    workers)
+            field = _free_field(problem, sample, radius, n_components, degree,
+                                top, options, workers)
+        if options.normalise == 'stamps':
+            return field
+        return _with_wings(field, sample, read_exposures(*given),
+                           options.normalise)
 
 
 def _read(given, options):

@@ -34,6 +34,7 @@ from photutils_mgauss.psf.contexts import PSFContext, known_contexts
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['MixtureField']
 
@@ -530,9 +531,11 @@ class MixtureField(Field):
                 given | {name: value}))) for value in values]
             return PSFContext(name, np.array(values), usual, tuple(layers))
         kind = self._kind(exposure, flux, contexts)
-        return grid(kind, errors=self.psf_errors(exposure=exposure, **given),
-                    contexts=[context(*one) for one in self._free_contexts(
-                        contexts, flux)])
+        with waiting('MixtureField.to_grid'):
+            return grid(
+                kind, errors=self.psf_errors(exposure=exposure, **given),
+                contexts=[context(*one) for one in self._free_contexts(
+                    contexts, flux)])
 
     def _free_contexts(self, contexts, flux):
         """Yield name, values and usual value of contexts not given."""

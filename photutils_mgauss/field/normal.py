@@ -21,7 +21,7 @@ import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.rows import kernel_rows_of_logs
-from photutils_mgauss.utils.parallel import Threads
+from photutils_mgauss.utils.parallel import SINGLE_BLAS, Threads
 
 # The chi^2 of a size beyond the widest, its logarithm by one.
 _WALL = 1e4
@@ -141,7 +141,12 @@ class Equations:
 
 
 class Workers:
-    """Split stars over the threads or processes of an executor."""
+    """
+    Split stars over the threads or processes of an executor.
+
+    Linear algebra has no threads meanwhile: those of its many small matrices
+    would mostly wait for each other.
+    """
 
     # The same on every machine, so that sums over parts round alike.
     N_PARTS = 16
@@ -153,13 +158,17 @@ class Workers:
         self.told = None
 
     def __enter__(self):
+        SINGLE_BLAS.__enter__()
         if self._own:
             self.executor = Threads()
         return self
 
     def __exit__(self, *error):
-        if self._own:
-            self.executor.__exit__(*error)
+        try:
+            if self._own:
+                self.executor.__exit__(*error)
+        finally:
+            SINGLE_BLAS.__exit__(*error)
 
     def tell(self, stage=None):
         """Tell who watches that a stage begins, or that a pass is done."""
@@ -186,17 +195,41 @@ def equations(problem, coefficients, workers):
         problem.sources, problem.anchors, problem.hold, problem.n_sources,
         problem.sky, problem.used)
     workers.tell()
-    matrix = sum(part.matrix for part in parts)
-    matrix = np.triu(matrix) + np.triu(matrix, 1).T
+    matrix = _unpacked(sum(part.matrix for part in parts),
+                       problem.basis.shape[1])
     return Equations(matrix, sum(part.right for part in parts),
                      np.concatenate([part.chi2 for part in parts]),
                      np.concatenate([part.sources for part in parts]),
                      np.concatenate([part.sky for part in parts]))
 
 
+def _unpacked(pairs, n_terms):
+    """Return the matrix of pairs of numbers and pairs of terms."""
+    rows, columns = (_triangle(n) for n in (_order(len(pairs)), n_terms))
+    full = pairs[:, columns][rows].transpose(0, 2, 1, 3)
+    size = len(rows) * n_terms
+    return full.reshape(size, size)
+
+
+def _order(n):
+    """Return the order of a matrix with n elements in its triangle."""
+    return (int(np.sqrt(8 * n + 1)) - 1) // 2
+
+
+def _triangle(n):
+    """Return where the elements (n, n) of a symmetric matrix are kept."""
+    place = np.zeros((n, n), int)
+    place[np.triu_indices(n)] = np.arange(n * (n + 1) // 2)
+    return np.maximum(place, place.T)
+
+
 @dataclass
 class _PartEquations:
-    """The kernel's call for some of the stars, picklable for processes."""
+    """
+    The kernel's call for some of the stars, picklable for processes.
+
+    Its matrices are those of `kernels.FieldSums`.
+    """
 
     coefficients: np.ndarray
     fit_sky: bool
@@ -205,8 +238,10 @@ class _PartEquations:
 
     def __call__(self, data, weights, corners, basis, local, sources,
                  anchors, hold, n_sources, sky, used):
-        size = to_vector(self.coefficients).size
-        total, right = np.zeros((size, size)), np.zeros(size)
+        right = np.zeros(to_vector(self.coefficients).size)
+        n_terms = basis.shape[1]
+        total = np.zeros([n * (n + 1) // 2 for n in (right.size // n_terms,
+                                                     n_terms)])
         chi2 = np.empty(len(data))
         sources, sky = sources.copy(), sky.copy()
         for first in range(0, len(data), _CHUNK):

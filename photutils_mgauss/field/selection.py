@@ -12,6 +12,7 @@ from photutils_mgauss.field.stamps import cut_stamps
 from photutils_mgauss.utils.image import read_level, read_pixels, with_unit
 from photutils_mgauss.utils.star_columns import read_sources, words_column
 from photutils_mgauss.utils.validation import as_integer, as_real
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['select_psf_stars']
 
@@ -114,21 +115,22 @@ def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
     min_snr = as_real(min_snr, 'min_snr', minimum=0)
     if max_stars is not None:
         max_stars = as_integer(max_stars, 'max_stars', minimum=1)
-    if sources is None:
-        sources = _detect(pixels, fwhm, threshold, finder)
-    table = _measure(pixels, read_sources(sources, 'sources'), radius)
-    saturation = (np.inf if saturation is None else
-                  read_level(saturation, 'saturation', pixels.unit))
-    _judge(table, isolation, saturation, min_snr)
-    if catalogue is not None:
-        _prefer(table, read_sources(catalogue, 'catalogue'))
-    if max_stars is not None:
-        _thin_out(table, max_stars, pixels.shape)
-    table['selected'] = np.asarray(table['reason']) == ''
-    table.remove_columns([name for name in table.colnames
-                          if name.startswith('_')])
-    for name in ('flux', 'peak'):
-        table[name] = with_unit(table[name], pixels.unit)
+    with waiting('select_psf_stars'):
+        if sources is None:
+            sources = _detect(pixels, fwhm, threshold, finder)
+        table = _measure(pixels, read_sources(sources, 'sources'), radius)
+        saturation = (np.inf if saturation is None else
+                      read_level(saturation, 'saturation', pixels.unit))
+        _judge(table, isolation, saturation, min_snr)
+        if catalogue is not None:
+            _prefer(table, read_sources(catalogue, 'catalogue'))
+        if max_stars is not None:
+            _thin_out(table, max_stars, pixels.shape)
+        table['selected'] = np.asarray(table['reason']) == ''
+        table.remove_columns([name for name in table.colnames
+                              if name.startswith('_')])
+        for name in ('flux', 'peak'):
+            table[name] = with_unit(table[name], pixels.unit)
     return table
 
 

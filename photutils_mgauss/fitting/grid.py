@@ -13,6 +13,7 @@ from photutils_mgauss.fitting.node_images import (
 from photutils_mgauss.fitting.nodes import fit_nodes
 from photutils_mgauss.fitting.phases import FLUX_LIMIT
 from photutils_mgauss.psf.grid import check_lattice, make_grid
+from photutils_mgauss.utils.waiting import waiting
 
 
 def fit_gridded_psf(psf, n_components, **kwargs):
@@ -39,9 +40,11 @@ def fit_node_images(nodes, n_components, *, scaled=True, **kwargs):
     The first is a `~photutils_mgauss.psf.grid.Grid`.
     """
     check_lattice(nodes.positions)
-    if n_components is None:
-        n_components, kwargs = choose(nodes, kwargs)
-    mixtures, scales, report = fit_nodes(nodes, n_components, **kwargs)
+    with waiting('fit mixtures to PSF images',
+                 kwargs.get('progress_bar', False)):
+        if n_components is None:
+            n_components, kwargs = choose(nodes, kwargs)
+        mixtures, scales, report = fit_nodes(nodes, n_components, **kwargs)
     if not any(mixtures):
         msg = ('psf must have at least one image that can be fitted, but '
                f'all failed, the first: {report["message"][0]}')

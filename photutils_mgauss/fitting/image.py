@@ -6,6 +6,7 @@ density per native pixel at :math:`((i - x_o) / s_x, (j - y_o) / s_y)` from
 the star, with :math:`(x_o, y_o)` the origin and s the oversampling. So the
 pixels of a PSF of unit flux sum to :math:`s_x s_y`, as in photutils.
 """
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import partial
@@ -38,6 +39,7 @@ from photutils_mgauss.utils.validation import (
     as_real,
     as_shape,
 )
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['FitStatus', 'MixtureFit', 'fit_mixture']
 
@@ -325,9 +327,10 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
         has_error=pixels.error is not None)
     weights = _as_weights(pixels)
     starts = _as_starts(start, len(images), problem)
-    fits = map_chunks(partial(_fit_stack, problem),
-                      (images, weights, starts), executor,
-                      most=_LARGEST_CHUNK)
+    with waiting('fit_mixture') if not single else nullcontext():
+        fits = map_chunks(partial(_fit_stack, problem),
+                          (images, weights, starts), executor,
+                          most=_LARGEST_CHUNK)
     fits = [fit_with_unit(fit, pixels.unit) for fit in fits]
     if not single:
         return fits

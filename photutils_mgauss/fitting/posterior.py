@@ -31,6 +31,7 @@ from photutils_mgauss.utils.validation import (
     as_real,
     as_rng,
 )
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['MixturePosterior', 'sample_mixture']
 
@@ -272,9 +273,10 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
     ------
     TypeError, ValueError
         As by `fit_mixture`; also for a stack of images, without
-        ``pixel_scale`` for the paper's priors, or if a Gaussian has no flux
+        ``pixel_scale`` for the paper's priors, if a Gaussian has no flux
         in the least-squares solution, so that its shape has no posterior of
-        its own: use fewer.
+        its own: use fewer; or for an image without noise, which says nothing
+        of the width of its posterior: add what is expected.
 
     Notes
     -----
@@ -330,12 +332,12 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
         raise ValueError(msg)
     draws = as_integer(draws, 'draws', minimum=4)
     data = SamplingData.prepare(image, fit, prior, unit, kwargs)
-    model = build_model(data)
     seed = None if rng is None else int(as_rng(rng).integers(2**31))
-    idata = sample(model, sampler, progressbar=progress_bar, cores=cores,
-                   random_seed=seed, draws=draws,
-                   tune=as_integer(tune, 'tune', minimum=0),
-                   chains=as_integer(chains, 'chains', minimum=1))
+    with waiting('sample_mixture', progress_bar):
+        idata = sample(build_model(data), sampler, progressbar=progress_bar,
+                       cores=cores, random_seed=seed, draws=draws,
+                       tune=as_integer(tune, 'tune', minimum=0),
+                       chains=as_integer(chains, 'chains', minimum=1))
     return _posterior(idata, data, fit, pixels.unit)
 
 

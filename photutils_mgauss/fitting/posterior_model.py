@@ -15,6 +15,9 @@ from photutils_mgauss.utils.quiet import without_warnings
 # The paper's priors, in arcsec: Eq. 4.
 _PAPER_ALPHA, _PAPER_BETA, _PAPER_GAMMA, _PAPER_SIGMA = 0.037, 1.0, 0.9, 1.0
 
+# An image that differs from its solution by less of its peak has no noise.
+_ROUNDING = 1e-12
+
 # In vectors the numbers of each Gaussian are log flux, x, y, log beta_x,
 # log beta_y, atanh gamma.
 
@@ -53,8 +56,9 @@ class SamplingData(NamedTuple):
         error = options.get('error')
         if error is not None:
             error = np.broadcast_to(error, used.shape)[used] / scale
-        noise = fit.residual[used] / scale / (1 if error is None else error)
-        sigma = max(noise.std(), 1e-12 * abs(values).max())
+        noise = fit.residual[used] / scale
+        _check_noise(noise, values)
+        sigma = (noise if error is None else noise / error).std()
         shapes = adaptive_moments(image, mask=~used,
                                   oversampling=options.get('oversampling', 1),
                                   origin=options.get('origin'))
@@ -75,6 +79,17 @@ class SamplingData(NamedTuple):
             beta_prior=(_PAPER_BETA,) if paper else (np.log(size), 1.0),
             gamma_width=_PAPER_GAMMA, prior=prior, unit=unit,
             ordered=_well_ordered(u0, spread))
+
+
+def _check_noise(noise, values):
+    """Raise if an image is its solution, to rounding."""
+    share = noise.std() / np.abs(values).max()
+    if share < _ROUNDING:
+        msg = ('image must have noise: it differs from the least-squares '
+               f'solution by {share:.0e} of its peak, which is rounding, and '
+               'nothing says how wide the posterior is; add the noise that '
+               'is expected, as image + rng.normal(0, sigma, image.shape)')
+        raise ValueError(msg)
 
 
 def _lattice(image, options):
@@ -114,7 +129,8 @@ def _whiten(fit, unit, tied, alpha_width):
     reduced = (basis / width[:, None]).T @ covariance @ (basis
                                                          / width[:, None])
     values, vectors = np.linalg.eigh(reduced)
-    values = np.maximum(values, 1e-16)
+    # Smaller ones are rounding, whatever the noise is.
+    values = np.maximum(values, 1e-16 * min(values.max(), 1.0))
     root = vectors * np.sqrt(values / (1 + values))
     return u0.ravel(), width[:, None] * (basis @ root)
 

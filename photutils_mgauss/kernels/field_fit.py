@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from photutils_mgauss.kernels.gaussian import LOG_NOTHING
-from photutils_mgauss.kernels.jit import inner, kernel
+from photutils_mgauss.kernels.jit import inner, kernel, loop
 from photutils_mgauss.kernels.linear import back_substitute, clear, eliminate
 from photutils_mgauss.kernels.pixels import N_NODES, shape_integrals
 from photutils_mgauss.kernels.rows import render
@@ -66,8 +66,9 @@ class FieldSums(NamedTuple):
     """
     Normal equations of a field, and chi2 (n,) of each star.
 
-    total (P T, P T), upper triangle, and gradient (P T,) order unknowns by
-    number, then term.
+    total (P (P + 1) / 2, T (T + 1) / 2) has a row for each pair of numbers
+    and a column for each pair of terms, as they come in an upper triangle;
+    gradient (P T,) orders unknowns by number, then term.
     """
 
     total: np.ndarray
@@ -79,7 +80,7 @@ class _PixelScratch(NamedTuple):
     """
     Memory for the derivatives of pixels.
 
-    block (4, D); for a row of integrated pixels design (s, D), the integrals
+    block (8, D); for a row of integrated pixels design (s, D), the integrals
     of one Gaussian (6, s), nodes (2, 8) and edges (6, s + 1).
     """
 
@@ -94,7 +95,7 @@ class _PixelScratch(NamedTuple):
 def _scratch(n_columns, side, integrated):
     side = side if integrated else 0
     return _PixelScratch(
-        np.empty((4, n_columns)), np.empty((side, n_columns)),
+        np.empty((8, n_columns)), np.empty((side, n_columns)),
         np.empty((6, side)), np.empty((2, N_NODES)), np.empty((6, side + 1)))
 
 
@@ -201,8 +202,8 @@ def _accumulate(stamp, weight, left, bottom, psf, sources, n_sources, sky,
     Sum the normal equations of a stamp into normal; return their size.
 
     The size includes the column of the residual. psf are rows and whether
-    they are integrated. Four pixels at a time, those of scratch.block, save
-    three of four walks through normal.
+    they are integrated. Eight pixels at a time, those of scratch.block, save
+    seven of eight walks through normal.
     """
     rows, integrated = psf
     block = scratch.block
@@ -239,24 +240,28 @@ def _accumulate(stamp, weight, left, bottom, psf, sources, n_sources, sky,
             for m in range(size):
                 row[m] *= root
             filled += 1
-            if filled == 4:
+            if filled == 8:
                 _add_products(block, size, normal)
                 filled = 0
-    for m in range(filled, 4):
+    for m in range(filled, 8):
         clear(block[m], size)
     _add_products(block, size, normal)
     return size
 
 
-@inner
+@loop
 def _add_products(block, size, normal):
-    """Add the products of the columns of block (4, D), upper triangle."""
+    """Add the products of the columns of block (8, D), upper triangle."""
     r0, r1, r2, r3 = block[0], block[1], block[2], block[3]
+    r4, r5, r6, r7 = block[4], block[5], block[6], block[7]
     for m in range(size):
         out = normal[m]
         c0, c1, c2, c3 = r0[m], r1[m], r2[m], r3[m]
+        c4, c5, c6, c7 = r4[m], r5[m], r6[m], r7[m]
         for n in range(m, size):
-            out[n] += c0 * r0[n] + c1 * r1[n] + c2 * r2[n] + c3 * r3[n]
+            out[n] += ((c0 * r0[n] + c1 * r1[n] + c2 * r2[n] + c3 * r3[n])
+                       + (c4 * r4[n] + c5 * r5[n] + c6 * r6[n]
+                          + c7 * r7[n]))
 
 
 @inner
@@ -316,7 +321,7 @@ def field_normal(stars, shapes, fit_sky, n_steps, normal, sums):
     total, gradient, chi2 = sums
     scratch = _scratch(normal.shape[0], stars.stamps.shape[2], integrated)
     step = np.empty(normal.shape[0])
-    spread = np.empty(gradient.size)
+    squares = np.empty(total.shape[1])
     condensed = np.empty((jacobians.shape[2], jacobians.shape[2] + 1))
     for star in range(chi2.size):
         used = stars.used[star]
@@ -329,10 +334,10 @@ def field_normal(stars, shapes, fit_sky, n_steps, normal, sums):
             continue
         if jacobians.size:
             _condense(normal, own, size, jacobians[star], condensed)
-            _spread(condensed, 0, condensed.shape[1], basis[star], spread,
+            _spread(condensed, 0, condensed.shape[1], basis[star], squares,
                     total, gradient)
         else:
-            _spread(normal, own, size, basis[star], spread, total, gradient)
+            _spread(normal, own, size, basis[star], squares, total, gradient)
 
 
 @inner(allocates=True)
@@ -357,21 +362,29 @@ def _condense(normal, own, size, jacobian, out):
 
 
 @inner
-def _spread(normal, own, size, basis, spread, total, gradient):
+def _spread(normal, own, size, basis, squares, total, gradient):
     """Add A (x) B B^T to total, A being what is left of normal."""
     n_terms = basis.size
+    at = 0
+    for t in range(n_terms):
+        for u in range(t, n_terms):
+            squares[at] = basis[t] * basis[u]
+            at += 1
+    at = 0
     for p in range(size - own - 1):
         for q in range(p, size - own - 1):
-            for t in range(n_terms):
-                spread[q * n_terms + t] = normal[own + p, own + q] * basis[t]
+            _add_scaled(normal[own + p, own + q], squares, total[at])
+            at += 1
         right = normal[own + p, size - 1]
         for t in range(n_terms):
-            b = basis[t]
-            if b != 0:
-                at = p * n_terms + t
-                gradient[at] += b * right
-                for j in range(p * n_terms, spread.size):
-                    total[at, j] += b * spread[j]
+            gradient[p * n_terms + t] += basis[t] * right
+
+
+@loop
+def _add_scaled(factor, values, out):
+    """Add values, times a factor, to out."""
+    for i in range(values.size):
+        out[i] += factor * values[i]
 
 
 @kernel

@@ -17,6 +17,7 @@ from photutils_mgauss.motions.terms import FUNCTIONS
 from photutils_mgauss.sky.observers import julian_years
 from photutils_mgauss.sky.transforms import Transform
 from photutils_mgauss.utils.validation import as_choice, as_real
+from photutils_mgauss.utils.waiting import waiting
 
 RECIPES = ('joint', 'two-step', 'paper')
 MATCH_BY = ('auto', 'id', 'sky', 'pattern')
@@ -178,12 +179,13 @@ class ProperMotionFitter:
             fewer references than its map needs.
         """
         options = self._options()
-        sightings = assemble(epochs, self.references, self._how_to_match(),
-                             options.transform, options.wanted)
-        setup, state = prepare(sightings, options)
-        result = (fit(setup, state) if options.recipe != 'paper'
-                  else fit_paper(setup, state))
-        return solution_of(result, self._ref_year())
+        with waiting('ProperMotionFitter.fit'):
+            sightings = assemble(epochs, self.references, self._how_to_match(),
+                                 options.transform, options.wanted)
+            setup, state = prepare(sightings, options)
+            result = (fit(setup, state) if options.recipe != 'paper'
+                      else fit_paper(setup, state))
+            return solution_of(result, self._ref_year())
 
     def _ref_year(self):
         if self.ref_epoch is None:

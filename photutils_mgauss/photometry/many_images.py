@@ -51,6 +51,7 @@ from photutils_mgauss.utils.image import read_pixels
 from photutils_mgauss.utils.saturation import without_saturated
 from photutils_mgauss.utils.star_columns import check_table, column_values
 from photutils_mgauss.utils.validation import as_shape
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['add_sky_positions', 'fit_many', 'to_flux_densities']
 
@@ -288,19 +289,21 @@ def fit_many(images, coordinates, *, fit_shape=11, common_flux=False):
     if not isinstance(coordinates, SkyCoord):
         msg = f'coordinates must be a SkyCoord, got {coordinates!r:.80}'
         raise TypeError(msg)
-    pixels, psfs, frames, units = zip(*map(_read_image, images), strict=True)
-    if any(unit != units[0] for unit in units):
-        msg = f'images must have one unit, got {units}'
-        raise ValueError(msg)
-    joint, scale = joint_images(
-        pixels, psfs, np.zeros(len(images), int) if common_flux else
-        np.arange(len(images)), fit_sky=False)
-    vectors = np.asarray(coordinates.reshape(-1).icrs.cartesian.xyz.value)
-    plane = TangentPlane.around(vectors)
-    state, converged = _fit_places(joint, frames, plane,
-                                   plane.project(vectors), fit_shape)
-    weighted = all(image.error.size for image in joint.images)
-    return _table(state, converged, plane, scale, units[0], weighted)
+    with waiting('fit_many'):
+        pixels, psfs, frames, units = zip(*map(_read_image, images),
+                                          strict=True)
+        if any(unit != units[0] for unit in units):
+            msg = f'images must have one unit, got {units}'
+            raise ValueError(msg)
+        joint, scale = joint_images(
+            pixels, psfs, np.zeros(len(images), int) if common_flux else
+            np.arange(len(images)), fit_sky=False)
+        vectors = np.asarray(coordinates.reshape(-1).icrs.cartesian.xyz.value)
+        plane = TangentPlane.around(vectors)
+        state, converged = _fit_places(joint, frames, plane,
+                                       plane.project(vectors), fit_shape)
+        weighted = all(image.error.size for image in joint.images)
+        return _table(state, converged, plane, scale, units[0], weighted)
 
 
 def joint_images(pixels, psfs, shared, *, fit_sky):

@@ -47,6 +47,7 @@ from photutils_mgauss.utils.per_thread import PerThread, keep
 from photutils_mgauss.utils.saturation import as_saturation
 from photutils_mgauss.utils.star_columns import plain_values
 from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['MixturePSFPhotometry']
 
@@ -245,14 +246,17 @@ class MixturePSFPhotometry(PSFPhotometry):
                           stacklevel=2)
         if isinstance(data, NDData):
             compat.check_nddata(mask, error)
-        call = compat.for_one_call(self)
-        try:
-            table = call._measure(read_pixels(data, error, mask), init_params)
-        finally:
-            keep(self, **{name: getattr(call, name)
-                          for name in compat.OF_A_CALL if name != 'fit_info'},
-                 psf_residual=call.psf_residual, _fit_info=call._fit_info)
-        self._tell_of_correlation()
+        with waiting(type(self).__name__, self.progress_bar):
+            call = compat.for_one_call(self)
+            try:
+                table = call._measure(read_pixels(data, error, mask),
+                                      init_params)
+            finally:
+                keep(self, psf_residual=call.psf_residual,
+                     _fit_info=call._fit_info, **{
+                         name: getattr(call, name)
+                         for name in compat.OF_A_CALL if name != 'fit_info'})
+            self._tell_of_correlation()
         return table
 
     def _measure(self, pixels, init_params):

@@ -38,6 +38,7 @@ from photutils_mgauss.pixel_motions.tables import (
     star_table,
 )
 from photutils_mgauss.utils.validation import as_choice, as_real, as_shape
+from photutils_mgauss.utils.waiting import waiting
 
 UNSURE = NOT_CONVERGED | WANDERED | BAD_POSITION
 FLUXES = ('image', 'band', 'common')
@@ -162,15 +163,16 @@ class PixelMotionFitter:
             For each of the notes of the solution.
         """
         self._check()
-        if stars is None:
-            stars = self.find(images)
-        campaign = self._read(images, stars)
-        listed = read_stars(stars, campaign)
-        frames = None
-        if self.refine_frames:
-            campaign, frames = refined(campaign, partial(
-                self._stars, listed, reach=None))
-        solution = self._solve(campaign, listed, frames)
+        with waiting('PixelMotionFitter.fit', self.progress_bar):
+            if stars is None:
+                stars = self.find(images)
+            campaign = self._read(images, stars)
+            listed = read_stars(stars, campaign)
+            frames = None
+            if self.refine_frames:
+                campaign, frames = refined(campaign, partial(
+                    self._stars, listed, reach=None))
+            solution = self._solve(campaign, listed, frames)
         for sentence in solution.notes:
             warnings.warn(sentence, AstropyUserWarning, stacklevel=2)
         return solution
@@ -218,17 +220,19 @@ class PixelMotionFitter:
         if max_parallax is not None and not self.parallax:
             msg = 'max_parallax must be given with parallax=True only'
             raise ValueError(msg)
-        campaign = self._read(images, stars)
-        look = partial(candidates, campaign, (largest[0], largest[1] or 0.0),
-                       executor=self.executor)
-        known = ([] if stars is None else
-                 [self._solve(campaign, read_stars(stars, campaign))])
-        bright = look(_light(campaign, known), threshold=BRIGHT)
-        found = [self._found(campaign, bright)]
-        faint = look(_light(campaign, known + found),
-                     false_alarm=false_alarm)
-        every = vstack([bright, _apart(campaign, faint, bright)])
-        table = self._found(campaign, every).stars
+        with waiting('PixelMotionFitter.find', self.progress_bar):
+            campaign = self._read(images, stars)
+            look = partial(candidates, campaign,
+                           (largest[0], largest[1] or 0.0),
+                           executor=self.executor)
+            known = ([] if stars is None else
+                     [self._solve(campaign, read_stars(stars, campaign))])
+            bright = look(_light(campaign, known), threshold=BRIGHT)
+            found = [self._found(campaign, bright)]
+            faint = look(_light(campaign, known + found),
+                         false_alarm=false_alarm)
+            every = vstack([bright, _apart(campaign, faint, bright)])
+            table = self._found(campaign, every).stars
         table['evidence'] = every['evidence']
         # What does not stay where it was found is no star.
         return table[(table['flags'] & UNSURE) == 0]

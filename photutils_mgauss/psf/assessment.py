@@ -19,6 +19,7 @@ from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.validation import as_choice, as_shape
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['PSFAssessment', 'assess_psf']
 
@@ -168,8 +169,9 @@ def assess_psf(model, truth, grid=(30, 30), *, shape=None, oversampling=1,
     x, y = _places(rows, columns, _detector(model, truth, shape), mid_cell)
     if mid_cell:
         rows, columns = rows - 1, columns - 1
-    real, mine = (_moments(*_profiles(psf, name, oversampling), x, y)
-                  for psf, name in ((truth, 'truth'), (model, 'model')))
+    with waiting('assess_psf'):
+        real, mine = (_moments(*_profiles(psf, name, oversampling), x, y)
+                      for psf, name in ((truth, 'truth'), (model, 'model')))
     table = QTable({'x': x, 'y': y, 'r2': real.r2,
                     'size_error': real.relative_size_error(mine),
                     'ellipticity_error': real.ellipticity_error(mine),

@@ -22,6 +22,7 @@ from photutils_mgauss.utils.validation import (
     as_rng,
     as_shape,
 )
+from photutils_mgauss.utils.waiting import waiting
 
 __doctest_requires__ = {'Optics*': ['galsim']}
 
@@ -198,9 +199,10 @@ class Optics:
         places = chebyshev.chebpts1(min(n_samples, n_nodes))
         if n_nodes <= n_samples:
             places = nodes
-        images = np.array([[self._sample(*self._place(u, v), oversampling,
-                                         radius) for u in places]
-                           for v in places])
+        with waiting('Optics.to_gridded_psf'):
+            images = np.array([[self._sample(*self._place(u, v), oversampling,
+                                             radius) for u in places]
+                               for v in places])
         share = _interpolation(places, nodes)
         images = np.einsum('jb,ia,bayx->jiyx', share, share, images,
                            optimize=True)

@@ -35,6 +35,7 @@ from photutils_mgauss.utils.validation import (
     as_rng,
     as_shape,
 )
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['Scene', 'render_stars', 'simulate', 'simulate_catalogues',
            'simulate_epochs']
@@ -221,8 +222,9 @@ def simulate(sources, exposure=None, *, instrument=None, psf=None,
     chip = Chip(instrument, effects, exposure)
     # Photutils wants fluxes with the unit of the image, which has none.
     truth['flux'] = truth['flux'].value
-    electrons, flags = expose(chip, truth, psf, rng, executor)
-    image, error = read(chip, electrons, rng, executor)
+    with waiting('simulate'):
+        electrons, flags = expose(chip, truth, psf, rng, executor)
+        image, error = read(chip, electrons, rng, executor)
     return Scene(image, error, flags, truth, psf, chip.sky, exposure,
                  instrument, wcs)
 
@@ -270,10 +272,11 @@ def simulate_epochs(sources, exposures, *, instrument=None, psfs=None,
     instrument = _instrument(instrument)
     psfs = _each_psf(psfs, exposures, instrument)
     seeds = as_rng(rng).spawn(len(exposures))
-    return [simulate(sources, exposure, instrument=instrument, psf=psf,
-                     effects=effects, rng=seed, executor=executor)
-            for exposure, psf, seed in zip(exposures, psfs, seeds,
-                                           strict=True)]
+    with waiting('simulate_epochs'):
+        return [simulate(sources, exposure, instrument=instrument, psf=psf,
+                         effects=effects, rng=seed, executor=executor)
+                for exposure, psf, seed in zip(exposures, psfs, seeds,
+                                               strict=True)]
 
 
 def simulate_catalogues(sources, exposures, *, instrument=None, psfs=None,
@@ -322,10 +325,11 @@ def simulate_catalogues(sources, exposures, *, instrument=None, psfs=None,
     psfs = _each_psf(psfs, exposures, instrument)
     threshold = as_real(threshold, 'threshold', minimum=0)
     seeds = as_rng(rng).spawn(len(exposures))
-    return [_catalogue(sources, exposure, instrument, psf, threshold, seed,
-                       executor)
-            for exposure, psf, seed in zip(exposures, psfs, seeds,
-                                           strict=True)]
+    with waiting('simulate_catalogues'):
+        return [_catalogue(sources, exposure, instrument, psf, threshold, seed,
+                           executor)
+                for exposure, psf, seed in zip(exposures, psfs, seeds,
+                                               strict=True)]
 
 
 def _catalogue(sources, exposure, instrument, psf, threshold, rng, executor):
@@ -404,7 +408,8 @@ def render_stars(psf, x, y, flux, shape, *, faintest=1e-3, executor=None):
     flux = as_floats(flux, 'flux', shape=x.shape)
     shape = as_shape(shape, 'shape')
     faintest = as_real(faintest, 'faintest', above=0)
-    return draw(psf, x, y, flux, shape, faintest, executor)
+    with waiting('render_stars'):
+        return draw(psf, x, y, flux, shape, faintest, executor)
 
 
 def _truth(sources, exposure, instrument, wcs):

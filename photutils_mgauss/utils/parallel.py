@@ -124,7 +124,7 @@ class _SingleBlas:
                 self._limits.restore_original_limits()
 
 
-_SINGLE_BLAS = _SingleBlas()
+SINGLE_BLAS = _SingleBlas()
 
 
 def _fulfil(future, call):
@@ -155,6 +155,11 @@ def watched(watcher):
         yield
     finally:
         _WATCHER.reset(token)
+
+
+def is_watched():
+    """Whether somebody wants to know how the work in this context gets on."""
+    return _WATCHER.get() is not None
 
 
 def tell(done, total):
@@ -200,7 +205,7 @@ def map_parallel(function, *columns, executor=None, long=False):
     if n_threads < 2 and not waits:
         yield from _told(map(function, *columns), n)
         return
-    with _SINGLE_BLAS, Threads(n_threads) as pool:
+    with SINGLE_BLAS, Threads(n_threads) as pool:
         yield from _told(pool.map(function, *columns), n)
 
 

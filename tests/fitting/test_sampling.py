@@ -117,6 +117,24 @@ def test_bad_arguments_are_named(image, arguments, words):
         sample_mixture(image, **{'n_components': 2, **arguments})
 
 
+def test_the_noise_may_be_small(image):
+    faint = 50 * TRUTH.render((15, 15), 7, 7)
+    faint += 1e-9 * (image - faint)
+    found = sample_mixture(faint, 2, draws=100, tune=150, chains=1, cores=1,
+                           rng=2)
+    assert_allclose(found.sigma.mean(), 2e-11, rtol=0.2)
+    # As many steps of the sampler as with any noise: it is scaled.
+    assert np.median(found.idata['sample_stats']['n_steps']) <= 15
+    errors = np.sqrt(np.diag(found.fit.covariance)).reshape(2, 6)
+    assert_allclose(found.means.std(axis=(0, 1)), errors[:, 1:3], rtol=0.5)
+
+
+@pytest.mark.parametrize('error', [None, 0.02])
+def test_an_image_without_noise_is_refused(error):
+    with pytest.raises(ValueError, match=r'image must have noise: .* add the'):
+        sample_mixture(50 * TRUTH.render((15, 15), 7, 7), 2, error=error)
+
+
 def test_what_the_posterior_has_no_place_for_is_refused(image):
     with pytest.raises(ValueError, match='image must have the shape'):
         sample_mixture([image, image], 2)
