@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from photutils_mgauss import kernels
 from photutils_mgauss.photometry.bright_residual import (
@@ -87,11 +88,13 @@ class _Wings:
     @cached_property
     def pairs(self):
         """Pixels near each other: both, and the number of their distance."""
-        dy, dx = (at[:, None] - at for at in (self.row, self.column))
-        one, other = np.nonzero((np.abs(dy) <= _REACH)
-                                & (np.abs(dx) <= _REACH))
-        return one, other, ((dy[one, other] + _REACH) * _SIDE
-                            + dx[one, other] + _REACH)
+        y, x = (at - at.min() + _REACH for at in (self.row, self.column))
+        number = np.full((y.max() + _SIDE, x.max() + _SIDE), -1)
+        number[y, x] = np.arange(y.size)
+        dy, dx = np.indices((_SIDE, _SIDE)).reshape(2, -1) - _REACH
+        near = number[y[:, None] - dy, x[:, None] - dx]
+        one, lag = np.nonzero(near >= 0)
+        return one, near[one, lag], lag
 
     def summed(self, products):
         """Return sums (side, side) of products of pairs, for each distance."""
@@ -110,28 +113,29 @@ class _Wings:
         return left[one] * left[other]
 
     def matrix(self, correlation):
-        """Return the covariances (m, m) of how stars differ."""
+        """Return the covariances (m, m) of how stars differ, sparse."""
         one, other, lag = self.pairs
-        out = np.zeros((self.row.size,) * 2)
-        out[one, other] = (correlation.ravel()[lag] * self.spread[one]
-                           * self.spread[other])
-        return out
+        values = (correlation.ravel()[lag] * self.spread[one]
+                  * self.spread[other])
+        return csr_array((values, (one, other)), (self.row.size,) * 2)
 
     def expected(self, correlation):
         """Return what the fit takes of the products of pairs."""
         one, other, _ = self.pairs
-        matrix = self.matrix(correlation) + np.diag(self.noise**2)
-        moved = self.shifts @ matrix
-        taken = self.design.T @ moved
-        taken += taken.T - self.design.T @ (
-            moved @ self.shifts.T) @ self.design
-        return taken[one, other]
+        moved = (self.shifts @ self.matrix(correlation)
+                 + self.shifts * self.noise**2)
+        # The symmetric part of what is left once the fit has taken twice.
+        moved -= (moved @ self.shifts.T) @ self.design / 2
+        taken = np.zeros(one.size)
+        for design, more in zip(self.design, moved, strict=True):
+            taken += design[one] * more[other] + design[other] * more[one]
+        return taken
 
     def covariance(self, correlation):
         """Return the covariance (3, 3) of flux, x and y."""
         # Correlations that end somewhere may be none of any pixels.
         values, vectors = np.linalg.eigh(
-            self.shifts @ self.matrix(correlation) @ self.shifts.T)
+            (self.shifts @ self.matrix(correlation)) @ self.shifts.T)
         return (vectors * np.maximum(values, 0)) @ vectors.T
 
 
