@@ -186,7 +186,7 @@ def _sparse(image, psf, options):
 def _crowded(image, psf, options):
     from photutils_mgauss.crowded.photometry import CrowdedMixturePhotometry
     if psf is None:
-        psf = _own_psf(image, options)
+        psf = own_psf(image, options)
     photometry = CrowdedMixturePhotometry(
         psf, threshold=options.threshold or 4.5,
         effective_gain=image.noise.gain, checkpoint=options.checkpoint,
@@ -195,7 +195,7 @@ def _crowded(image, psf, options):
     return photometry(image.data, error=image.noise.total, mask=image.mask)
 
 
-def _own_psf(image, options):
+def own_psf(image, options):
     """Return the PSF of the stars of a crowded image."""
     from photutils_mgauss.crowded.own_psf import fit_crowded_psf
     from photutils_mgauss.crowded.psf_loop import grid_of

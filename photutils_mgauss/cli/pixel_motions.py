@@ -2,7 +2,7 @@
 from functools import cache, partial
 from pathlib import Path
 
-from photutils_mgauss.cli import tools
+from photutils_mgauss.cli import crowded_motions, tools
 from photutils_mgauss.cli.observers import check_observer, observer_at
 from photutils_mgauss.cli.progress import Progress
 from photutils_mgauss.cli.results import Results, file_marks
@@ -21,10 +21,16 @@ def add_options(parser):
     group = parser.add_argument_group('motions from pixels')
     group.add_argument('--pixels', action='store_true',
                        help='fit each star to the pixels of all images '
-                            'together; takes --psf')
-    group.add_argument('--psf', nargs='+', metavar='FILE',
+                            'together; takes --psf. With --crowded all '
+                            'stars and the sky are fitted together')
+    group.add_argument('--psf', nargs='+', default=[], metavar='FILE',
                        help='with --pixels: the PSF of all images, or one of '
-                            'each')
+                            'each (default with --crowded: made of the stars '
+                            'of each image)')
+    group.add_argument('--band', nargs='+', metavar='NAME',
+                       help='with --pixels: the filter of all images, or of '
+                            'each, if they differ: stars have one flux or '
+                            'similar ones in images of a filter')
     group.add_argument('--frames', metavar='FOLDER',
                        help='with --pixels: what mgauss motions wrote of '
                             'these exposures before, for the corrected WCS '
@@ -43,7 +49,8 @@ def add_options(parser):
 
 def check_alone(options):
     """Raise for options that need --pixels, which is not given."""
-    for name in ('psf', 'frames', 'targets', 'forced', 'refine_frames'):
+    for name in ('psf', 'band', 'frames', 'targets', 'forced',
+                 'refine_frames'):
         if getattr(options, name):
             msg = (f'--{name.replace("_", "-")} must be given with --pixels '
                    'only')
@@ -54,8 +61,10 @@ def run(options):
     """Measure the motions."""
     paths, folder = options.inputs, Path(options.output)
     _check(options)
-    names = {name: folder / f'{name}.{options.format}' for name in _TABLES}
+    names = {name: folder / f'{name}.{options.format}'
+             for name in _tables(options)}
     owners = tools.one_each(options.psf, len(paths), 'psf')
+    bands = tools.one_each(options.band, len(paths), 'band')
     read = tools.read_images(options, paths)
     results = Results(options)
     results.claim(list(names.values()), [*paths, *options.psf])
@@ -65,10 +74,10 @@ def run(options):
             step(f'read {path}')
             image = read(i)
             frame = _frame(options, i)
-            epochs.append(_epoch(options, image, owners[i], frame))
+            epochs.append(_epoch(options, image, owners[i], frame, bands[i]))
             marks.append([file_marks(path, owners[i], frame),
                           image.content])
-            tools.say(options, f'{path}: {epochs[i]!r}')
+            tools.say(options, f'{path}: {epochs[i] or image.describe()!r}')
         if options.frames and _frame_errors_file(options) is None:
             tools.say(options, _EXACT)
         if results.only_planned():
@@ -86,10 +95,19 @@ def run(options):
               f'files are in {folder}')
 
 
+def _tables(options):
+    """Return the names of the tables."""
+    # That of a crowded field has the fluxes of all images.
+    return _TABLES[:1] if options.crowded else _TABLES
+
+
 def _check(options):
     """Raise for what is wrong before anything is read."""
-    if not options.psf:
-        msg = '--pixels must have --psf, the PSF of all images or of each'
+    if options.crowded:
+        crowded_motions.check(options)
+    elif not options.psf:
+        msg = ('--pixels must have --psf, the PSF of all images or of each; '
+               'only --crowded makes it of their stars')
         raise ValueError(msg)
     if options.forced and not options.targets:
         msg = '--forced must have --targets, a table of places'
@@ -130,13 +148,10 @@ def _frame(options, i):
     raise ValueError(msg)
 
 
-def _epoch(options, image, psf, frame):
-    """Return the `ImageEpoch` of an image."""
-    from photutils_mgauss.cli.psf_files import read_psf
+def _epoch(options, image, psf, frame, band):
+    """Return the `ImageEpoch`, or None if a dry run would make its PSF."""
     from photutils_mgauss.files.image_layers import read_wcs
     from photutils_mgauss.pixel_motions import ImageEpoch
-    with tools.about(psf):
-        model = read_psf(psf)
     wcs = image.wcs if frame is None else read_wcs(frame)
     with tools.about(image.path):
         for what, value, option in (('a WCS', wcs, '--wcs or --frames'),
@@ -146,28 +161,48 @@ def _epoch(options, image, psf, frame):
                 raise ValueError(msg)
         observer = observer_at(options.observer, image.path, options.inputs,
                                image.time)
-        data = image.without_sky
-        if image.unit is not None:
-            data = data * image.unit
-        error = image.noise.background
-        return ImageEpoch(data, model, wcs, image.time, mask=image.mask,
-                          error=error if image.unit is None
-                          else error * image.unit, observer=observer)
+    model = _psf(options, image, psf)
+    if model is None:
+        return None
+    with tools.about(image.path):
+        data, error, mask = (
+            (image.data, image.noise.total, image.useless)
+            if options.crowded else
+            (image.without_sky, image.noise.background, image.mask))
+        unit = 1 if image.unit is None else image.unit
+        return ImageEpoch(data * unit, model, wcs, image.time, mask=mask,
+                          error=error * unit, band=band, observer=observer)
+
+
+def _psf(options, image, file):
+    """Return the PSF of a file or else of the image's stars."""
+    from photutils_mgauss.cli.psf_files import read_psf
+    if file is not None:
+        with tools.about(file):
+            return read_psf(file)
+    return None if options.dry_run else crowded_motions.own_psf(options,
+                                                                image)
 
 
 def _solve(options, epochs):
-    """Return the solution."""
+    """Return the tables that a solution makes, by name."""
     from photutils_mgauss.files.tables import read_table
-    from photutils_mgauss.pixel_motions import PixelMotionFitter
     stars = None
     if options.targets is not None:
         stars, _ = read_table(options.targets)
+    frames = _frame_errors(options)
+    if options.crowded:
+        return {'motions': crowded_motions.solve(options, epochs, stars,
+                                                 frames)}, ()
+    from photutils_mgauss.pixel_motions import PixelMotionFitter
     fitter = PixelMotionFitter(parallax=options.parallax,
-                               forced=options.forced,
-                               references=_frame_errors(options),
+                               forced=options.forced, references=frames,
                                refine_frames=options.refine_frames,
                                fit_shape=options.fit_shape)
-    return fitter.fit(epochs, stars)
+    solution = fitter.fit(epochs, stars)
+    return {'motions': solution.stars, 'images': solution.images,
+            'light_curves': solution.fluxes,
+            'cutouts': solution.cutouts()}, solution.notes
 
 
 def _frame_errors(options):
@@ -192,11 +227,8 @@ def _frame_errors_file(options):
 
 def _made(options, solve, name):
     """Return one of the tables of a solution, and what writes it."""
-    solution = solve()
-    table = (solution.cutouts() if name == 'cutouts' else
-             getattr(solution, {'motions': 'stars', 'images': 'images',
-                                'light_curves': 'fluxes'}[name]))
-    more = {'notes': list(solution.notes)}
+    tables, notes = solve()
+    table, more = tables[name], {'notes': list(notes)}
     if name == 'motions' and options.frames is not None:
         more['catalogues'] = _gain(options, table)
     return table, partial(tools.write_table, table,

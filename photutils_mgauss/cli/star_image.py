@@ -19,6 +19,8 @@ from photutils_mgauss.files.image_header import (
 from photutils_mgauss.files.image_layers import read_layers, read_wcs
 from photutils_mgauss.photometry.noise import background_error, pixel_error
 from photutils_mgauss.sky.observers import julian_years
+from photutils_mgauss.utils.image import PixelData
+from photutils_mgauss.utils.saturation import without_saturated
 
 # The sky is not measured in boxes with a larger share of bad pixels [%].
 _BAD_SHARE = 50.0
@@ -138,6 +140,12 @@ class StarImage:
             return None
         level = self.saturation - float(self.sky.background_median)
         return level if level > 0 else None
+
+    @cached_property
+    def useless(self):
+        """Which pixels are bad or next to saturated ones, (ny, nx)."""
+        return without_saturated(PixelData(self.data, None, self.mask),
+                                 self.saturation).mask
 
     def say_saturation(self):
         """Return a sentence on what is saturated."""

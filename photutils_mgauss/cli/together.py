@@ -70,7 +70,7 @@ def _entry(image, psf):
             msg = 'must have a WCS, got none; give --wcs'
             raise ValueError(msg)
     data = NDData(image.data, StdDevUncertainty(image.noise.total),
-                  mask=image.mask, unit=image.unit)
+                  mask=image.useless, unit=image.unit)
     return data, psf, image.wcs
 
 

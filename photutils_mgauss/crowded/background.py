@@ -7,6 +7,9 @@ from photutils_mgauss import kernels
 _TIE = 1e-3
 # So often the start of a sloping sky is looked for in what it leaves over.
 _START_ROUNDS = 6
+# A plane is fitted to about so many pixels a side, those further from the last
+# one than so many times their median left out, so often.
+_PLANE_PIXELS, _PLANE_CLIP, _PLANE_ROUNDS = 512, 3.0, 5
 
 
 class Mesh:
@@ -105,8 +108,10 @@ class Mesh:
 
     def start(self, data, good, noise):
         """Return levels (n,) from which a fit of the sky can start."""
-        # Where the sky slopes, faint pixels are those down the slope.
-        level = np.zeros(self.size)
+        # Where the sky slopes, faint pixels are those down the slope: with or
+        # without a plane, all that follows is to be the same.
+        a, b, c = _plane(data, good)
+        level = (a + b * self.x + c * self.y[:, None]).ravel()
         for _ in range(_START_ROUNDS):
             level += self.faint_level(data - self.image(level), good, noise)
         return level
@@ -164,6 +169,26 @@ class Mesh:
             owner[np.clip(np.rint(p).astype(int), 0, owner.size - 1)]
             for p, owner in zip((y, x), self._owner, strict=True))
         return row * self.x.size + column
+
+
+def _plane(data, good):
+    """Return what a plane through most good pixels is at 0, and slopes."""
+    # The answer to another plane added to the data is that plane added.
+    step = tuple(slice(None, None, max(n // _PLANE_PIXELS, 1))
+                 for n in data.shape)
+    y, x = np.nonzero(good[step])
+    if not x.size:
+        return np.zeros(3)
+    values = data[step][y, x]
+    terms = np.stack([np.ones(x.size), x * step[1].step, y * step[0].step])
+    used = np.ones(x.size)
+    for _ in range(_PLANE_ROUNDS):
+        weighted = used * terms
+        plane = np.linalg.lstsq(weighted @ terms.T, weighted @ values,
+                                rcond=None)[0]
+        far = np.abs(values - plane @ terms)
+        used = (far <= _PLANE_CLIP * np.median(far)).astype(float)
+    return plane
 
 
 def _lattice(first, size, spacing):

@@ -334,8 +334,9 @@ class _Beside:
 
     def _draw(self, dx, dy):
         out = np.zeros((2 * self.half + 1,) * 2)
-        kernels.render(self._rows, self.half + dx, self.half + dy, 1.0,
-                       self._integrated, out)
+        # As floats: for integers the kernel would be compiled once more.
+        kernels.render(self._rows, self.half + float(dx),
+                       self.half + float(dy), 1.0, self._integrated, out)
         return out.ravel()
 
     def law(self, flux, photons, faint, hidden, numbers):

@@ -54,17 +54,19 @@ class Diffuse:
         self.level = _beyond(self.level, noise)
         return wide
 
-    def bound(self, data, good, noise, mesh, lowest):
+    def bound(self, data, good, noise, mesh, level, lowest):
         """
         Note between what levels light and sky together have to be.
 
         Stars only add light: there is no more of all else than in the median
         pixel of most blocks around, and no less than the lowest levels of the
-        mesh.
+        mesh; both, as the data, above levels of the mesh.
         """
-        self._low = lowest[mesh.owners(*self._places())]
+        places = tuple(self._places())
+        sky = mesh.at(*places, level)
+        self._low = sky + lowest[mesh.owners(*places)]
         middle = self.mesh.medians(data, good).reshape(self.mesh.shape)
-        self._high = median_filter(middle, 3).ravel() + 3 * noise
+        self._high = sky + median_filter(middle, 3).ravel() + 3 * noise
 
     def keep_bounds(self, mesh, level):
         """Make the light keep its bounds above levels of the mesh."""

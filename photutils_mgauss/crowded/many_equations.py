@@ -67,9 +67,10 @@ class ManyEquations:
         stars, factors = tile.stars, tile.job.factors
         hold = np.zeros((len(stars), factors.shape[2]))
         hold[:, :2] = stars.hold[:, None]
-        hold[:, 2:] = (reach_of(factors)[2:] / FARTHEST)**2
+        hold[:, 2:] = tile.usual[1]**-2
         bare = cls(each, tile.neighbours, factors, hold, np.column_stack(
-            [stars.drift.T, stars.rate]), None, tile.scales, tile.ties())
+            [stars.drift.T, stars.rate - tile.usual[0]]), None, tile.scales,
+            tile.ties())
         return replace(bare, pull=bare._expect(
             tile.fluxes, tile.options.count_slope, stars.hold > 0))
 
@@ -108,6 +109,15 @@ class ManyEquations:
             own = gathered(self.ties, scale * own)[self.ties.slot] / scale**2
         return np.divide(1, np.sqrt(own), where=own > 0,
                          out=np.zeros(own.shape))
+
+    def motion_errors(self):
+        """Return standard errors (n, p - 2) of motions, nothing else free."""
+        known = sum(np.einsum('xq,nxy,yq->nq', factor[:, 2:],
+                              one.stars.matrix[:, 1:, 1:], factor[:, 2:])
+                    for one, factor in zip(self.each, self.factors,
+                                           strict=True))
+        return np.divide(1, np.sqrt(np.maximum(known, 0)), where=known > 0,
+                         out=np.full(known.shape, np.inf))
 
     def summed(self, fluxes, information=None):
         """

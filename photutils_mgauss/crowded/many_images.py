@@ -40,6 +40,7 @@ class Settings(NamedTuple):
     executor: object
     progress_bar: bool
     checkpoint: Checkpoint
+    saturation: object = None
 
 
 def fit_images(images, listed, settings, *, motions):
@@ -52,7 +53,7 @@ def fit_images(images, listed, settings, *, motions):
         As of the method of `CrowdedMixturePhotometry`.
     settings : Settings
     """
-    field = read_field(images)
+    field = read_field(images, settings.saturation)
     given = None
     if listed is not None:
         u, v = grid_positions(listed, field.grid)

@@ -15,6 +15,7 @@ from photutils_mgauss import kernels
 from photutils_mgauss.crowded.search import (
     LEAST,
     REACH,
+    SEPARATION,
     apart,
     peaks,
     weakest,
@@ -48,7 +49,10 @@ def _evidence(tile, threshold):
     """Return the `~kernels.Evidence` of each image."""
     every, bare = [], np.zeros((2, *tile.shape))
     scratch = np.empty((2, *tile.shape))
-    planes = [_planes(model, tile.options.psf_error) for model in tile.models]
+    # PSFs of one camera are wrong in the same way: what each image makes of
+    # that does not average out.
+    error = tile.options.psf_error * np.sqrt(len(tile.models))
+    planes = [_planes(model, error) for model in tile.models]
     for k, (c, plane) in enumerate(zip(tile.job.scales, planes,
                                        strict=True)):
         one = kernels.Evidence(*np.empty((2, *tile.shape)), *scratch)
@@ -86,11 +90,32 @@ def leave_out(tile, threshold):
 
     Returns their places (n, 2).
     """
-    weak = weakest(tile.stars, tile.neighbours, strengths(tile), threshold,
+    least = np.full(len(tile.stars), threshold)
+    if threshold >= tile.options.keep:
+        least[_beside(tile, REACH)] = tile.options.threshold
+    weak = weakest(tile.stars, tile.neighbours, strengths(tile), least,
                    tile.shape)
+    # Two stars at a place share its light, and seem to move apart.
+    weak |= _beside(tile, SEPARATION) & ~tile.stars.listed
     places = np.column_stack([tile.stars.x[weak], tile.stars.y[weak]])
     tile.dismiss(weak)
     return places
+
+
+def _beside(tile, reach):
+    """
+    Tell which stars are within reach of a brighter one [pix].
+
+    What a PSF that is a little wrong leaves there looks like a weak star,
+    and with it the brighter one is free to move.
+    """
+    s, pairs = tile.stars, tile.neighbours
+    near = np.hypot(s.x[pairs.owner] - s.x[pairs.neighbour],
+                    s.y[pairs.owner] - s.y[pairs.neighbour]) < reach
+    fainter = s.flux[pairs.neighbour] < s.flux[pairs.owner]
+    out = np.zeros(len(s), bool)
+    out[pairs.neighbour[near & fainter]] = True
+    return out
 
 
 def strengths(tile):

@@ -37,6 +37,7 @@ def solve_many(job):
         find_all(tile, find, leave_out)
         if job.given is not None:
             associate(tile, job.given, leave_out)
+    tile.learn_motions()
     settle(tile, leave_out)
     tile.measure()
     return tile

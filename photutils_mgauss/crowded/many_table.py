@@ -55,12 +55,13 @@ def tabulate(tile):
     s, near = tile.stars, tile.neighbours
     quality = [quality_of(model) for model in tile.models]
     place, variance, correlation = tile.equations.covariances()
+    s, place = _by_itself(tile, place)
     hidden = _hidden(tile, variance)
     factor = np.array([misfit(one) for one in quality])
     count, chi2 = (np.array([one[:, i] for one in quality]) for i in (0, 1))
     informed = np.nan_to_num(tile.measured**2 / variance)
-    place = place * _mean(factor * (1 + np.array(
-        [one.position for one in hidden])**2), informed)[:, None, None]
+    place = _widened(place, _mean(factor, informed), _mean(factor * (
+        1 + np.array([one.position for one in hidden])**2), informed))
     variance = np.where(count > 0, variance * factor, np.nan)
     strength, _ = strength_of(tile, variance)
     strength = np.nan_to_num(strength)
@@ -83,6 +84,33 @@ def tabulate(tile):
     return table.chosen(inside(table, tile.job.core))
 
 
+def _by_itself(tile, place):
+    """
+    Return stars and covariances (n, p, p) without what is thought of each.
+
+    What is thought of the motions of its neighbours stays.
+    """
+    s, p = tile.stars, place.shape[1]
+    if p == 2:
+        return s, place
+    hold = tile.equations.hold.copy()
+    hold[:, :2] = 0
+    good = np.isfinite(place).all(axis=(1, 2))
+    known = np.linalg.inv(np.where(good[:, None, None], place, np.eye(p)))
+    known[:, np.arange(p), np.arange(p)] -= hold
+    good &= np.linalg.eigvalsh(known)[:, 0] > 0
+    known[~good] = np.eye(p)
+    own = np.linalg.inv(known)
+    shift = np.einsum('nij,nj->ni', own, hold * tile.equations.drift)
+    shift[~good] = 0
+    alone = place.copy()
+    # Of a motion that its pixels do not tell nothing is known.
+    alone[:, 2:], alone[:, :, 2:] = np.nan, np.nan
+    return s.replaced(
+        x=s.x + shift[:, 0], y=s.y + shift[:, 1],
+        rate=s.rate + shift[:, 2:]), np.where(good[:, None, None], own, alone)
+
+
 def _hidden(tile, variance):
     """Return what stars that were not found do in each image."""
     options = tile.options
@@ -100,6 +128,18 @@ def _hidden(tile, variance):
             model, tile.job.parts[k].origin, one, np.sqrt(variance[k]),
             flux=tile.job.scales[k] * tile.stars.flux, share=share))
     return out
+
+
+def _widened(place, misfit, beside):
+    """
+    Return covariances (n, p, p) times a misfit (n,), places ``beside`` others.
+
+    What hides beside a star is there in all images: it moves the place, but
+    seems not to move.
+    """
+    factor = np.sqrt(np.stack([beside] * 2 + [misfit] * (
+        place.shape[1] - 2), axis=1))
+    return place * factor[:, :, None] * factor[:, None, :]
 
 
 def _mean(values, weights):

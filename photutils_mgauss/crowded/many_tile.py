@@ -8,16 +8,24 @@ rows of a grid on the sky; the fluxes are those of the images.
 from dataclasses import dataclass
 
 import numpy as np
+from astropy.stats import mad_std
 from scipy.stats import chi2
 
 from photutils_mgauss import kernels
 from photutils_mgauss.crowded.many_equations import (
+    FARTHEST,
     ManyEquations,
     reach_of,
 )
 from photutils_mgauss.crowded.model import Model
 from photutils_mgauss.crowded.stars import Neighbours, Stars
-from photutils_mgauss.crowded.tile import CELL, REST, ROAM, TileOptions
+from photutils_mgauss.crowded.tile import (
+    CELL,
+    REST,
+    ROAM,
+    Searched,
+    TileOptions,
+)
 
 # Templates are drawn for so many parts of a pixel along each axis.
 _PHASES = 4
@@ -30,6 +38,9 @@ _FREE = 3.0
 # each: scales are not better known. So has one whose fluxes would be as
 # different by a smaller chance than this.
 _SURE, _CONSTANT = 100.0, 1e-5
+# How stars of a field move is learnt from the part of them whose motions are
+# best known, if these are so many; others may be so many times as fast.
+_BEST, _FEW, _WIDER = 0.25, 20, 2.0
 
 
 @dataclass(frozen=True)
@@ -119,7 +130,7 @@ class SharedModel(Model):
         kernels.turn_stamps(chosen, self.stamps, self.slopes)
 
 
-class ManyTile:
+class ManyTile(Searched):
     """
     The models of all images of a `ManyJob`, their equations, and the stars.
 
@@ -134,13 +145,17 @@ class ManyTile:
     equations : ManyEquations
     points : list of kernels.Points
     phases : list of kernels.Phases
+    usual : (2, p - 2) `~numpy.ndarray`
+        How stars are thought to move before they are measured: the mean and
+        the standard deviation.
     measured : (E, n) `~numpy.ndarray`
         Fluxes of all images, each free.
-    rejected, repeats, widths, moved
+    widths, moved
         As of `Tile`; ``widths`` are those of each image.
     """
 
     def __init__(self, job):
+        super().__init__()
         self.job, self.options = job, job.options
         self.origin, self.shape = job.origin, job.shape
         self.scales = job.scales[:, None]
@@ -148,9 +163,10 @@ class ManyTile:
         self.points = [one.points(job.shape) for one in job.maps]
         self.phases = [phases(part.psf, part.data.shape)
                        for part in job.parts]
-        self.rejected, self.repeats = np.empty((0, 2)), []
         self.widths = [np.empty(0)] * len(job.parts)
         self.moved = np.empty(0)
+        far = FARTHEST / reach_of(job.factors)[2:]
+        self.usual = np.stack([np.zeros(far.shape), far])
         self.stars = self._at_rest(Stars([], [], []))
         # Pixels of the grid may be smaller than those of some images.
         middle = [np.array([n / 2]) for n in job.shape[::-1]]
@@ -223,6 +239,19 @@ class ManyTile:
             seen[bands == one].any(axis=0) for one in np.unique(bands))
         self.stars.constant &= square < chi2.isf(_CONSTANT,
                                                  np.maximum(free, 1))
+
+    def learn_motions(self):
+        """Learn from the best known motions how stars usually move."""
+        rate, error = self.stars.rate, self.equations.motion_errors()
+        n = int(_BEST * len(rate))
+        if rate.shape[1] == 0 or n < _FEW:
+            return
+        best = np.argsort(error.max(axis=1), kind='stable')[:n]
+        middle = np.median(rate[best], axis=0)
+        spread = np.maximum(mad_std(rate[best], axis=0), error[best].max())
+        far = FARTHEST / reach_of(self.job.factors)[2:]
+        self.usual = np.stack([middle, np.minimum(_WIDER * spread, far)])
+        self._form_equations()
 
     def measure(self):
         """Find the fluxes of all images at the places that there are."""
@@ -383,17 +412,6 @@ class ManyTile:
             step = _step(np.where(restless[k], light[k], 0), shift)
             model.take_in_place(step, levels[k], np.flatnonzero(restless[k]))
         self._form_equations()
-
-    # What a search leaves behind.
-
-    def reject(self, places):
-        """Remember places (n, 2) where no star is to be added again."""
-        self.rejected = np.concatenate([self.rejected, places])
-
-    def note_repeats(self, entries, host):
-        """Remember which numbers' stars the entries of a list mean."""
-        self.repeats += zip(entries.number, host, entries.x_init,
-                            entries.y_init, strict=True)
 
     def note_widths(self, measure):
         """Remember by how much each image's PSF is too narrow."""

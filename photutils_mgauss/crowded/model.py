@@ -79,14 +79,15 @@ class Model:
             self.level = self.first_level = np.zeros(self.mesh.size)
             self.limits = -np.inf, np.inf
             return
-        self.level = self.mesh.start(self.data, self.good, self.noise)
-        self.first_level = self.level.copy()
-        self.limits = self.mesh.limits(self.data, self.good, self.noise)
-        self.level += self.diffuse.begin(
-            self.data - self.mesh.image(self.level), self.good, self.noise,
-            self.mesh)
-        self.diffuse.bound(self.data, self.good, self.noise, self.mesh,
-                           self.limits[0])
+        start = self.first_level = self.mesh.start(self.data, self.good,
+                                                   self.noise)
+        # On a slope the faint pixels of a node say where it is low.
+        flat = self.data - self.mesh.image(start)
+        low, high = self.mesh.limits(flat, self.good, self.noise)
+        self.limits = start + low, start + high
+        self.level = start + self.diffuse.begin(flat, self.good, self.noise,
+                                                self.mesh)
+        self.diffuse.bound(flat, self.good, self.noise, self.mesh, start, low)
 
     def _put(self, stars):
         self.stars = stars

@@ -402,7 +402,7 @@ class CrowdedMixturePhotometry:
             table, unfinished, errors = fit_images(images, stars, Settings(
                 self._options, self._model_of, self._bound, self.tile_shape,
                 self.overlap, self.executor, self.progress_bar,
-                self._checkpoint), motions=motions)
+                self._checkpoint, self.saturation), motions=motions)
         Solved(table, unfinished, errors).check()
         return table
 

@@ -16,7 +16,7 @@ _HINT = 0.4
 REACH = 2.3
 LEAST = 0.05
 # No star is added this close to another, or to one that was taken away [pix].
-_SEPARATION = 0.3
+SEPARATION = 0.3
 _REJECTED = 0.5
 # Stars whose light is on the image may be this far outside [pix].
 _OUTSIDE = 3.0
@@ -64,7 +64,7 @@ def apart(found, known, rejected):
     out = np.ones(len(found), bool)
     positions = np.column_stack([found.x, found.y])
     stars = np.column_stack([known.x, known.y])
-    for places, limit in ((stars, _SEPARATION), (rejected, _REJECTED)):
+    for places, limit in ((stars, SEPARATION), (rejected, _REJECTED)):
         if len(places) and len(found):
             out &= cKDTree(places).query(positions)[0] > limit
     return out

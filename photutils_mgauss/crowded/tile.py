@@ -76,7 +76,33 @@ class TileJob:
             self.given is not None and len(self.given) == 0)
 
 
-class Tile:
+class Searched:
+    """
+    What a search of stars leaves behind on a tile.
+
+    Attributes
+    ----------
+    rejected : (n, 2) `~numpy.ndarray`
+        Where stars have been taken away for good.
+    repeats : list of (number, number, x, y) tuple
+        The entries of a list that mean the star of another.
+    """
+
+    def __init__(self):
+        self.rejected = np.empty((0, 2))
+        self.repeats = []
+
+    def reject(self, places):
+        """Remember places (n, 2) where no star is to be added again."""
+        self.rejected = np.concatenate([self.rejected, places])
+
+    def note_repeats(self, entries, host):
+        """Remember which numbers' stars the entries of a list mean."""
+        self.repeats += zip(entries.number, host, entries.x_init,
+                            entries.y_init, strict=True)
+
+
+class Tile(Searched):
     """
     The model of a `TileJob`, its equations, and what a search has to know.
 
@@ -87,10 +113,6 @@ class Tile:
     model : Model
     equations : Equations
         Those of the model as it is.
-    rejected : (n, 2) `~numpy.ndarray`
-        Where stars have been taken away for good.
-    repeats : list of (number, number, x, y) tuple
-        The entries of a list that mean the star of another.
     widths : (n,) `~numpy.ndarray`
         By how much the PSF is too narrow at bright stars.
     moved : (n,) `~numpy.ndarray`
@@ -98,11 +120,10 @@ class Tile:
     """
 
     def __init__(self, job):
+        super().__init__()
         self.model = Model(job)
         self.options = job.options
         self.origin = job.origin
-        self.rejected = np.empty((0, 2))
-        self.repeats = []
         self.widths = np.empty(0)
         self.moved = np.empty(0)
         self.templates = _templates(job.psf, job.data.shape)
@@ -212,17 +233,6 @@ class Tile:
         """Find the diffuse light again."""
         self.model.update_diffuse()
         self._form_equations()
-
-    # What a search leaves behind.
-
-    def reject(self, places):
-        """Remember places (n, 2) where no star is to be added again."""
-        self.rejected = np.concatenate([self.rejected, places])
-
-    def note_repeats(self, entries, host):
-        """Remember which numbers' stars the entries of a list mean."""
-        self.repeats += zip(entries.number, host, entries.x_init,
-                            entries.y_init, strict=True)
 
     def note_widths(self, measure):
         """Remember by how much the PSF is too narrow, as measured."""

@@ -99,7 +99,7 @@ class Field(ComparedByValue):
         -------
         `~matplotlib.axes.Axes`
         """
-        from photutils_mgauss.plotting import plot_field
+        from photutils_mgauss.plotting.field import plot_field
         return plot_field(self, quantity, n=n, ax=ax)
 
     def _repr_html_(self):

@@ -16,7 +16,7 @@ COMPONENTS = (2, 3, 4, 5, 6, 7)
 # What is taken without a choice, and from how few to how many stars there is
 # one by default: below there is nobody to ask, above it changes little.
 _USUAL_COMPONENTS, _USUAL_DEGREE = 6, 4
-_FEWEST_STARS, _MANY_STARS = 8, 60
+_FEWEST_STARS, MANY_STARS = 8, 60
 # The prior becomes stronger as long as that helps.
 _STRENGTHS = (1.0, 4.0, 16.0)
 # While the number of Gaussians is chosen, the degree is at most this, and the
@@ -34,12 +34,12 @@ _CLEAR_GAIN = 3.0
 def n_folds(n_stars):
     """Return into how many parts the stars are divided."""
     # Few stars are left out in smaller parts.
-    return 3 if n_stars >= _MANY_STARS else 5
+    return 3 if n_stars >= MANY_STARS else 5
 
 
 def by_default(n_components, degree, n_stars):
     """Replace None by 'auto' where few stars have to decide."""
-    few = _FEWEST_STARS <= n_stars < _MANY_STARS
+    few = _FEWEST_STARS <= n_stars < MANY_STARS
     usual = ('auto', 'auto') if few else (_USUAL_COMPONENTS, _USUAL_DEGREE)
     return (usual[0] if n_components is None else n_components,
             usual[1] if degree is None else degree)
@@ -79,7 +79,7 @@ def choose(problem, n_components, degree, max_degree, strength, workers):
     if n_components == 'auto':
         n_components, found = _climb(
             lambda k: score(k, strong), _FIRST_COMPONENTS, COMPONENTS)
-        if strength is None and len(problem.basis) < _MANY_STARS:
+        if strength is None and len(problem.basis) < MANY_STARS:
             strong = _climb(lambda s: found if s == 1 else score(
                 n_components, s), 1.0, _STRENGTHS)[0]
     if degree == 'auto':
@@ -165,6 +165,21 @@ def _left_out(fit, workers):
             damping=_FOLD_DAMPING)
         chi2[folds == fold] = _settled(outside, coefficients, workers)
     return chi2
+
+
+def is_better(before, after, workers):
+    """
+    Return whether the second of two fits is the better one.
+
+    That which describes more of the stars or, of as many, that which those
+    left out of it are more like.
+    """
+    more = after.problem.used.sum() - before.problem.used.sum()
+    if more:
+        return more > 0
+    scores = _mean(np.array([_left_out(one, workers)
+                             for one in (before, after)]))
+    return scores[1] < scores[0]
 
 
 def _settled(problem, coefficients, workers):

@@ -68,7 +68,7 @@ def honest_covariance(fit):
         The variances of the P shapes about their polynomials.
     """
     covariance = covariance_of(fit)
-    scale = _variation(fit)
+    scale = variation(fit)
     used = np.flatnonzero(fit.problem.used)
     if used.size < _FEWEST_STARS:
         return covariance, np.zeros(scale.size)
@@ -83,7 +83,7 @@ def honest_covariance(fit):
     return covariance + share * added, share * scale
 
 
-def _variation(fit):
+def variation(fit):
     """Return the variances (P,) by which shapes vary over the field."""
     variance = 1 / to_vector(fit.prior.precision).reshape(
         -1, len(fit.coefficients))

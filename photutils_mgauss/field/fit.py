@@ -20,8 +20,9 @@ from photutils_mgauss.field.base import (
     residual_stars,
     star_table,
 )
+from photutils_mgauss.field.beyond import add_degree
 from photutils_mgauss.field.brighter_fatter import measure_fattening
-from photutils_mgauss.field.choice import choose
+from photutils_mgauss.field.choice import MANY_STARS, choose
 from photutils_mgauss.field.contexts import lateral_shifts
 from photutils_mgauss.field.covariance import honest_covariance
 from photutils_mgauss.field.forms import TunedShapes
@@ -38,8 +39,9 @@ from photutils_mgauss.field.input import (
     read_exposures,
     read_sample,
 )
-from photutils_mgauss.field.misfit import misfit, softened_covariance
+from photutils_mgauss.field.misfit import misfit
 from photutils_mgauss.field.mixture_field import MixtureField
+from photutils_mgauss.field.noise import noise_covariance
 from photutils_mgauss.field.normal import Workers, model_stamps
 from photutils_mgauss.field.options import FieldOptions
 from photutils_mgauss.field.pixel import chosen_pixel, warn_of_phase
@@ -102,7 +104,9 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         The degree of the polynomials, 0 for a PSF that is the same
         everywhere; by default 4, or 'auto' with 8 to 59 stars, or 1 with
         ``start``. It is lowered, with a warning, if there are too few stars.
-        'auto' tries degrees from 0 to 5 in the same way. Terms that the stars
+        'auto' tries degrees from 0 to 5 in the same way; fewer than 60 stars
+        have one degree more, its terms as small as the stars ask for, where
+        left-out stars gain by it. Terms that the stars
         do not ask for are shrunk, so that a degree that is too high costs
         time more than accuracy.
     radius : float, optional
@@ -325,13 +329,14 @@ def _with_wings(field, sample, exposures, normalise):
 
 def _free(problem, n_components, degree, top, workers, strength, reject):
     """Return the fit, and the table of what was tried for it."""
+    few = degree == 'auto' and len(problem.basis) < MANY_STARS
     n_components, degree, strength, choice = choose(
         problem, n_components, degree if degree == 'auto' else top, top,
         strength, workers)
-    problem.basis = np.ascontiguousarray(
-        problem.basis[:, :stages.n_terms(degree)])
     fit = stages.run(problem, n_components, degree, workers,
                      strength=strength, reject=reject)
+    if few:
+        fit = add_degree(fit, problem.basis, degree, workers, reject=reject)
     if problem.pixel_integrated:
         _allow_for_misfit(fit, workers)
     return fit, choice
@@ -362,19 +367,25 @@ def _tuned(fit, sample, start, radius, centre):
     sample = sample.without_deviant(fit.problem.used)
     stddev = _centre_stddev(start.mixture_at(*_middle(sample)), radius, centre,
                             bool(getattr(start, 'pixel_integrated', False)))
-    covariance, unmodelled = honest_covariance(fit)
+    covariance, unmodelled = _errors(fit, sample)
     return TunedMixtureField(
         start, fit.coefficients, sample.shape, radius, covariance,
         star_table(fit, sample, stddev), residual_stars(fit), fit.accuracy,
         sample.dropped(), stddev, fit.problem.pixel_integrated, unmodelled)
 
 
+def _errors(fit, sample):
+    """Return the covariance of coefficients, and what is not modelled."""
+    covariance, unmodelled = honest_covariance(fit)
+    if fit.lack or any(sample.correlations):
+        covariance = covariance + (noise_covariance(
+            fit, sample.correlations, sample.growth) - covariance_of(fit))
+    return covariance, unmodelled
+
+
 def _result(fit, sample, radius, choice, centre, fatter):
     sample = sample.without_deviant(fit.problem.used)
-    covariance, unmodelled = honest_covariance(fit)
-    if fit.lack:
-        covariance = covariance + (softened_covariance(fit)
-                                   - covariance_of(fit))
+    covariance, unmodelled = _errors(fit, sample)
     n_terms = len(fit.coefficients) - fit.problem.n_extra
     field = MixtureField(
         fit.coefficients[:n_terms], sample.shape, radius, covariance, None,

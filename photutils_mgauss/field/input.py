@@ -85,9 +85,13 @@ class Sample:
         return np.array(places).T
 
     def problem(self, degree, local_bkg):
-        """Return the problem of a field with polynomials of a degree."""
+        """
+        Return the problem of a field with polynomials of a degree.
+
+        Those of one degree more are in its basis.
+        """
         places = normalised(*self.expected(), self.shape)
-        basis = stages.polynomials(*places, degree)
+        basis = stages.polynomials(*places, degree + 1)
         hold = np.full(self.sources.shape, _NEIGHBOUR_STDDEV**-2.0)
         hold[..., 2] = 1 / np.maximum(self.sources[..., 2] ** 2, 1e-300)
         n = len(basis)

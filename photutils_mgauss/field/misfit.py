@@ -24,11 +24,10 @@ pixel i alone is off; the most likely :math:`\epsilon` is taken.
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from photutils_mgauss import kernels
 from photutils_mgauss.field.base import covariance_of
 from photutils_mgauss.field.covariance import shape_covariance
-from photutils_mgauss.field.normal import model_stamps, to_vector
-from photutils_mgauss.psf.rows import kernel_rows_of_logs
+from photutils_mgauss.field.noise import derivatives
+from photutils_mgauss.field.normal import model_stamps
 
 # How far from the middle pixel of a star pixels are looked at: there is all
 # that a star narrower than two pixels says of its place.
@@ -74,55 +73,6 @@ def misfit(fit):
     return _most_likely(found, expected, response)
 
 
-def softened_covariance(fit):
-    """
-    Return the covariance of coefficients fitted under softened weights.
-
-    What Gaussians may lack is part of the weights but no noise: the inverse
-    of the normal equations counts it as such.
-
-    Parameters
-    ----------
-    fit : FieldFit
-        Its accuracy that of the light in pixels.
-
-    Returns
-    -------
-    (N, N) `~numpy.ndarray`
-    """
-    problem = fit.problem
-    light = model_stamps(problem, fit.coefficients) - problem.sky[:, None,
-                                                                  None]
-    light = np.maximum(light, 0)
-    variance = (problem.stamps.base + problem.stamps.slope * light
-                + (fit.accuracy * light) ** 2)
-    shapes = problem.shapes(fit.coefficients)
-    noise = np.diag(to_vector(fit.prior.precision))
-    for star in np.flatnonzero(problem.used):
-        noise += np.kron(
-            _gradient_covariance(problem, star, shapes[star], variance[star]),
-            np.outer(problem.basis[star], problem.basis[star]))
-    covariance = covariance_of(fit)
-    return covariance @ noise @ covariance
-
-
-def _gradient_covariance(problem, star, shapes, variance):
-    """Return the covariance (P, P) of the gradient of a star's shapes."""
-    inside = problem.weights[star] > 0
-    row, column = np.nonzero(inside)
-    x, y, flux = problem.sources[star, 0]
-    left, bottom = problem.stamps.corners[star]
-    _, own, by_shapes = _derivatives(left + column - x, bottom + row - y,
-                                     shapes, flux)
-    if problem.fit_sky:
-        own = np.vstack([own, np.ones(row.size)])
-    root = np.sqrt(problem.weights[star][inside])
-    axes, _ = np.linalg.qr((own * root).T)
-    free = by_shapes * root
-    free = (free - (free @ axes) @ axes.T) * root * np.sqrt(variance[inside])
-    return free @ free.T
-
-
 def _most_likely(found, noise, response):
     """Return epsilon from the sums of stars (n,)."""
     def cost(square):
@@ -144,33 +94,14 @@ def _pixels(problem, i, residual, shapes):
     inside = ((problem.weights[i] > 0)
               & (np.abs(column - np.rint(x_0)) <= _HALF)
               & (np.abs(row - np.rint(y_0)) <= _HALF))
-    value, own, by_shapes = _derivatives(column[inside] - x_0,
-                                         row[inside] - y_0, shapes, flux)
+    value, own, by_shapes = derivatives(
+        column[inside] - x_0, row[inside] - y_0, shapes, flux,
+        integrated=True)
     if problem.fit_sky:
         own = np.vstack([own, np.ones(value.size)])
     root = np.sqrt(problem.weights[i][inside])
     return (residual[inside] * root, flux * value * root, own * root,
             by_shapes * root)
-
-
-def _derivatives(x, y, shapes, flux):
-    """
-    Return the PSF in pixels, and derivatives of a star of some flux.
-
-    Those by its flux, x and y (3, n), and by its shapes (6 K - 3, n).
-    """
-    parts = np.empty((len(shapes), 6, x.size))
-    kernels.derivatives(x, y, kernel_rows_of_logs(shapes), True, parts)
-    g, gx, gy, gxx, gxy, gyy = parts.transpose(1, 0, 2)
-    s = shapes[:, 4, None]
-    across, along = (np.exp(-2 * shapes[:, i, None]) for i in (3, 5))
-    # Gaussians obey the heat equation, see `kernels.derivatives`.
-    by_shapes = flux * np.stack([
-        g, -gx, -gy, -across * gxx, along * (s * gxx + gxy),
-        -along * (gyy + s * s * gxx + 2 * s * gxy)], axis=1)
-    value = g.sum(axis=0)
-    own = np.stack([value, -flux * gx.sum(axis=0), -flux * gy.sum(axis=0)])
-    return value, own, by_shapes.reshape(-1, x.size)[3:]
 
 
 def _sums(residual, light, own, by_shapes, covariance):

@@ -418,7 +418,7 @@ def _stage(state, index, degree, workers, reject, *, adapt=False):
     terms = n_terms(degree)
     few = state.problem.subset(index).with_terms(terms)
     workers.tell(f'degree {degree}')
-    part = FieldFit(few, _raised(state.coefficients, terms, few.n_extra),
+    part = FieldFit(few, raised(state.coefficients, terms, few.n_extra),
                     state.prior.first(terms), None, state.accuracy,
                     np.zeros(few.stamps.good.shape, bool), state.blurs,
                     lack=state.lack)
@@ -494,7 +494,7 @@ def tune(problem, degree, workers, *, strength=1.0, reject=True):
 def _finish(state, degree, workers, reject):
     terms = n_terms(degree)
     state.problem = state.problem.with_terms(terms)
-    state.coefficients = _raised(state.coefficients, terms,
+    state.coefficients = raised(state.coefficients, terms,
                                  state.problem.n_extra)
     return polish(state, workers, reject)
 
@@ -553,7 +553,7 @@ def _groups(coefficients, kinds, n_extra):
     return groups
 
 
-def _raised(coefficients, terms, n_extra):
+def raised(coefficients, terms, n_extra):
     """Return the coefficients with further terms of zero."""
     known = len(coefficients) - n_extra
     full = np.zeros((terms + n_extra, *coefficients.shape[1:]))

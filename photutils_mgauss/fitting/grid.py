@@ -1,4 +1,4 @@
-"""Grids of mixtures fitted to the PSFs of other programs."""
+"""Grids of mixtures, and reports, fitted to the PSFs of other programs."""
 import warnings
 
 import numpy as np
@@ -13,7 +13,6 @@ from photutils_mgauss.fitting.node_images import (
 from photutils_mgauss.fitting.nodes import fit_nodes
 from photutils_mgauss.fitting.phases import FLUX_LIMIT
 from photutils_mgauss.psf.grid import check_lattice, make_grid
-from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.utils.waiting import waiting
 
 
@@ -34,9 +33,12 @@ def fit_image_psf(psf, n_components, *, grid_xypos, **kwargs):
     return fit_node_images(nodes, n_components, **kwargs)
 
 
-def fit_node_images(nodes, n_components, *, scaled=True,
-                    interpolation='blend', outside='clamp', **kwargs):
-    """Fit images and return the grid with the report of the fits."""
+def fit_node_images(nodes, n_components, *, scaled=True, **kwargs):
+    """
+    Fit images and return the grid of their mixtures, and the report.
+
+    The first is a `~photutils_mgauss.psf.grid.Grid`.
+    """
     check_lattice(nodes.positions)
     with waiting('fit mixtures to PSF images',
                  kwargs.get('progress_bar', False)):
@@ -55,8 +57,7 @@ def fit_node_images(nodes, n_components, *, scaled=True,
     report['bridged'] = [mixtures[i] is None for i in order]
     report['scale'] = grid.scales
     report['n_components'] = (grid.weights != 0).sum(axis=1)
-    return GriddedMixturePSF._of_grid(
-        grid, report, interpolation=interpolation, outside=outside)
+    return grid, report
 
 
 def _warn_of_phases(report, n_components):

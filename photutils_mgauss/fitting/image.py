@@ -194,7 +194,7 @@ class MixtureFit(ComparedByValue):
         ValueError
             If there is no mixture.
         """
-        from photutils_mgauss.plotting import plot_residual
+        from photutils_mgauss.plotting.fit import plot_residual
         if self.mixture is None:
             msg = f'a fit without a mixture cannot be drawn: {self.message}'
             raise ValueError(msg)

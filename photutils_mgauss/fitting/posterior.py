@@ -211,7 +211,7 @@ class MixturePosterior:
         -------
         (n, n) `~numpy.ndarray` of `~matplotlib.axes.Axes`
         """
-        from photutils_mgauss.plotting import plot_corner
+        from photutils_mgauss.plotting.posterior import plot_corner
         return plot_corner(self, names, axes=axes)
 
 

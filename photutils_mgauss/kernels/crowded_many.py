@@ -11,7 +11,9 @@ from photutils_mgauss.kernels.crowded_fit import (
     scale_matrix,
 )
 from photutils_mgauss.kernels.crowded_search import (
+    isolated,
     score_pixel,
+    squared,
     stars_around,
     template_products,
 )
@@ -62,36 +64,6 @@ def _phase(value, n):
     return pixel, min(max(int(floor((value - pixel + 0.5) * n)), 0), n - 1)
 
 
-@inner
-def _isolated(x, y, template, weight, residual):
-    """Return gradient and information of a star on a constant at a pixel."""
-    ny, nx = residual.shape
-    h = template.shape[0] // 2
-    pr = pp = ps = rs = ws = seen = power = 0.0
-    for j in range(-h, h + 1):
-        for i in range(-h, h + 1):
-            t = template[h + j, h + i]
-            power += t * t
-            if not (0 <= y + j < ny and 0 <= x + i < nx):
-                continue
-            w = weight[y + j, x + i]
-            r = residual[y + j, x + i]
-            wt = w * t
-            pr += wt * r
-            pp += wt * t
-            ps += wt
-            rs += w * r
-            ws += w
-            if w > 0:
-                seen += t * t
-    if not 3 * seen > power:
-        return 0.0, 0.0, 0.0, 0.0
-    info = pp - ps * ps / ws
-    if not info > 0:
-        return 0.0, 0.0, pr, pp
-    return pr - ps * rs / ws, info, pr, pp
-
-
 @kernel
 def evidence(points, phases, weight, residual, out):
     """Ask at each point of a grid what an image says of a star there."""
@@ -104,9 +76,9 @@ def evidence(points, phases, weight, residual, out):
             y, part_y = _phase(points.y[row, column], n)
             g = info = bare_g = bare = 0.0
             if 0 <= x < nx and 0 <= y < ny:
-                g, info, bare_g, bare = _isolated(
-                    x, y, stamps[y // cell, x // cell, part_y, part_x],
-                    weight, residual)
+                template = stamps[y // cell, x // cell, part_y, part_x]
+                g, info, bare_g, bare = isolated(
+                    x, y, template, squared(template), weight, residual)
             out.gradient[row, column] = g
             out.information[row, column] = info
             out.bare_gradient[row, column] = bare_g
@@ -381,26 +353,39 @@ def add_places(first, stars, pairs, factors, ties, together):
 
 @kernel(allocates=True)
 def invert_places(together):
-    """Overwrite together.free by its inverse, NaN where it has none."""
+    """
+    Overwrite together.free by its inverse, NaN where it has none.
+
+    Stars that cannot be told from all of their neighbours are taken with the
+    nearest ones only, the others where they are.
+    """
     largest, m = together.free.shape[1], together.members.shape[1]
+    p = largest // m
     scale, column = np.empty(largest), np.empty(largest)
     factor = np.empty((largest, largest))
     for i in range(together.count.size):
-        size = largest // m * together.count[i]
-        for a in range(size):
-            for b in range(size):
-                factor[a, b] = together.free[i, a, b]
-        scale_matrix(factor, size, scale)
-        solved = cholesky(factor, size, 1e-12)
-        for a in range(largest // m):
-            solved = solved and scale[a] > 0
-        for a in range(size):
-            for b in range(size):
+        free, whole = together.free[i], p * together.count[i]
+        count, solved = together.count[i], False
+        while count > 0 and not solved:
+            size = p * count
+            for a in range(size):
+                for b in range(size):
+                    factor[a, b] = free[a, b]
+            scale_matrix(factor, size, scale)
+            solved = cholesky(factor, size, 1e-12)
+            for a in range(p):
+                solved = solved and scale[a] > 0
+            if not solved:
+                count //= 2
+        for a in range(whole):
+            for b in range(whole):
+                free[a, b] = 0.0 if solved else np.nan
+        for a in range(p * count):
+            for b in range(p * count):
                 column[b] = 1.0 if a == b else 0.0
-            solve_factored(factor, size, column)
-            for b in range(size):
-                together.free[i, a, b] = (column[b] * scale[a] * scale[b]
-                                          if solved else np.nan)
+            solve_factored(factor, p * count, column)
+            for b in range(p * count):
+                free[a, b] = column[b] * scale[a] * scale[b]
 
 
 @kernel(allocates=True)

@@ -71,6 +71,49 @@ class BesideScratch(NamedTuple):
                    np.empty((size, 2)), np.empty(3))
 
 
+@inner
+def squared(template):
+    """Return the sum of the squares of a template's pixels."""
+    power = 0.0
+    for j in range(template.shape[0]):
+        for i in range(template.shape[1]):
+            power += template[j, i]**2
+    return power
+
+
+@inner
+def isolated(x, y, template, power, weight, residual):
+    """
+    Ask what a star of a template would be on a constant around a pixel.
+
+    Returns the gradient of half of -chi2 by its flux and the information on
+    it, both 0 where less than a third of power, that of the template, is left
+    by weights of zero; and the same without the constant.
+    """
+    ny, nx = residual.shape
+    h = template.shape[0] // 2
+    pr = pp = ps = rs = ws = seen = 0.0
+    for j in range(max(-h, -y), min(h + 1, ny - y)):
+        for i in range(max(-h, -x), min(h + 1, nx - x)):
+            w = weight[y + j, x + i]
+            t = template[h + j, h + i]
+            r = residual[y + j, x + i]
+            wt = w * t
+            pr += wt * r
+            pp += wt * t
+            ps += wt
+            rs += w * r
+            ws += w
+            if w > 0:
+                seen += t * t
+    if not 3 * seen > power:
+        return 0.0, 0.0, 0.0, 0.0
+    info = pp - ps * ps / ws
+    if not info > 0:
+        return 0.0, 0.0, pr, pp
+    return pr - ps * rs / ws, info, pr, pp
+
+
 @kernel
 def score(residual, weight, template, x_low, x_high, y_low, y_high, hint,
           significance, flux):
@@ -84,11 +127,7 @@ def score(residual, weight, template, x_low, x_high, y_low, y_high, hint,
     together stand out by hint standard errors.
     """
     ny, nx = residual.shape
-    h = template.shape[0] // 2
-    power = 0.0
-    for j in range(2 * h + 1):
-        for i in range(2 * h + 1):
-            power += template[j, i]**2
+    power = squared(template)
     for y in range(y_low, y_high):
         for x in range(x_low, x_high):
             rs = ws = 0.0
@@ -98,23 +137,9 @@ def score(residual, weight, template, x_low, x_high, y_low, y_high, hint,
                     ws += weight[j, i]
             if not rs > hint * sqrt(ws):
                 continue
-            pr = pp = ps = rs = ws = seen = 0.0
-            for j in range(max(-h, -y), min(h + 1, ny - y)):
-                for i in range(max(-h, -x), min(h + 1, nx - x)):
-                    w = weight[y + j, x + i]
-                    t = template[h + j, h + i]
-                    r = residual[y + j, x + i]
-                    wt = w * t
-                    pr += wt * r
-                    pp += wt * t
-                    ps += wt
-                    rs += w * r
-                    ws += w
-                    if w > 0:
-                        seen += t * t
-            info = pp - ps * ps / ws
-            if 3 * seen > power and info > 0:
-                flux[y, x] = (pr - ps * rs / ws) / info
+            g, info, _, _ = isolated(x, y, template, power, weight, residual)
+            if info > 0:
+                flux[y, x] = g / info
                 significance[y, x] = flux[y, x] * sqrt(info)
 
 

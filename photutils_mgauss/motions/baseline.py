@@ -50,21 +50,21 @@ def whole_baseline(years, catalogue):
     return float(np.nanmax(years) - np.nanmin(years))
 
 
-def check_baseline(epochs, catalogue):
+def check_baseline(years, catalogue):
     """
     Raise unless epochs, or a catalogue with them, span some time.
 
-    ``catalogue`` is None where there is none with places.
+    ``years`` are the mean years of the epochs, ``catalogue`` is None where
+    there is none with places.
     """
-    years = [epoch.mean_year for epoch in epochs]
     if max(years) - min(years) > 0:
         return
     if catalogue is not None and whole_baseline(years, catalogue) > 0:
         return
     remedy = ('; without one, references are needed that have positions with '
               'errors (ra_error, dec_error), of another time (ref_epoch)')
-    if len(epochs) < 2:
-        msg = f'epochs must be at least 2, got {len(epochs)}'
+    if len(years) < 2:
+        msg = f'epochs must be at least 2, got {len(years)}'
     else:
         msg = (f'epochs must have a time baseline, got all '
                f'{len(years)} at {years[0]:.6f}')

@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 from photutils_mgauss.motions.chips import rows_of_chips
-from photutils_mgauss.motions.epoch import numbers, pixels
+from photutils_mgauss.motions.columns import numbers, pixels
 from photutils_mgauss.sky.corrected_wcs import (
     Region,
     corrected_header,
@@ -71,7 +71,7 @@ def _correct_chips(epoch, correction, result, rows):
     """Return an epoch with corrected WCS of its chips, and their residual."""
     used = np.zeros(len(epoch.table), dtype=bool)
     used[rows] = True
-    x, y = pixels(epoch)
+    x, y = pixels(epoch.table)
     chips, residuals = {}, []
     for wcs, own, name in rows_of_chips(epoch):
         seen = own[used[own]]

@@ -4,7 +4,7 @@ import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss.motions.chips import rows_of_chips
-from photutils_mgauss.motions.epoch import pixels
+from photutils_mgauss.motions.columns import pixels
 from photutils_mgauss.sky.tangent_plane import (
     TangentPlane,
     directions,
@@ -36,9 +36,10 @@ def detector_residuals(residuals, epochs):
     for e, epoch in enumerate(epochs):
         if epoch.is_pixels:
             own = np.flatnonzero(number == e)
-            at = np.stack(pixels(epoch))[:, rows[own]]
+            at = pixels(epoch.table)[:, rows[own]]
             places[:, own] = at
-            for wcs, some, name in _parts(epoch, rows[own]):
+            for wcs, of_chip, name in rows_of_chips(epoch):
+                some = np.flatnonzero(np.isin(rows[own], of_chip))
                 which = own[some]
                 chips[which] = '' if name is None else str(name)
                 away[:, which] = _in_pixels(wcs, at[:, some],
@@ -48,15 +49,6 @@ def detector_residuals(residuals, epochs):
                          ('dx_pix', away[0]), ('dy_pix', away[1])):
         table[name] = values * u.pix
     return table
-
-
-def _parts(epoch, rows):
-    """Yield the WCS, the places in ``rows`` and the name of each chip."""
-    if epoch.chips is None:
-        yield epoch.wcs, np.arange(len(rows)), None
-        return
-    for wcs, own, name in rows_of_chips(epoch):
-        yield wcs, np.flatnonzero(np.isin(rows, own)), name
 
 
 def _in_pixels(wcs, at, residuals):

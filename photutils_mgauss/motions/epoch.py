@@ -1,8 +1,8 @@
 """
-One exposure: its table of stars, WCS, time and observer, and how it is read.
+One exposure: its table of stars, WCS, time and observer.
 
-Tables are used under photutils' column names. What leaves this module is a
-`Detections`: plain float64 arrays in the units of the frame.
+Tables are used under photutils' column names (`columns`); what they say is
+read by `detections`.
 """
 from dataclasses import dataclass, field, replace
 
@@ -11,48 +11,11 @@ import numpy as np
 from astropy.coordinates import CartesianRepresentation
 from astropy.table import Table
 
-from photutils_mgauss.motions.chips import (
-    chip_jacobian,
-    chip_vectors,
-    joined_chips,
-)
-from photutils_mgauss.motions.stacked import is_definite_2x2, sandwich_2x2
-from photutils_mgauss.sky.observers import (
-    _known_observer,
-    julian_years,
-    observer_velocity,
-    remove_aberration,
-)
-from photutils_mgauss.sky.tangent_plane import (
-    MAS,
-    TangentPlane,
-    local_axes,
-    unit_vectors,
-)
-from photutils_mgauss.sky.wcs import (
-    check_celestial,
-    pixel_jacobian,
-    pixel_to_vectors,
-)
-from photutils_mgauss.utils.star_columns import find_column, first_values
-
-# Columns with more names than one, in order of preference.
-COLUMNS = {
-    'x': ('x_fit', 'x'), 'y': ('y_fit', 'y'),
-    'x_err': ('x_err', 'x_error'), 'y_err': ('y_err', 'y_error'),
-    'ra_err': ('ra_error', 'ra_err'), 'dec_err': ('dec_error', 'dec_err'),
-    'flux': ('flux_fit', 'flux'),
-    'magnitude': ('mag', 'phot_g_mean_mag'),
-    'along_err': ('along_error', 'along_err'),
-}
-# What is not measured across a scan, in errors along it: far beyond what
-# counts as a measurement, near enough that covariances can be inverted.
-ACROSS = 1e5
-
-
-def names_of(key):
-    """Return the names that a column may have, the preferred one first."""
-    return COLUMNS.get(key, (key,))
+from photutils_mgauss.motions.chips import joined_chips
+from photutils_mgauss.motions.columns import COLUMNS, names_of
+from photutils_mgauss.sky.observers import _known_observer, julian_years
+from photutils_mgauss.sky.wcs import check_celestial
+from photutils_mgauss.utils.star_columns import find_column
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +194,12 @@ class Epoch:
         return 1.0 if self.plane_unit == 'pix' else None
 
     @property
+    def column_unit(self):
+        """The unit of columns x, y that have none of their own."""
+        is_angle = not self.is_sky and self.pixel_size is None
+        return u.mas if is_angle else u.pix
+
+    @property
     def years(self):
         """Julian years (TDB), a scalar or one per row."""
         if self.time is None:
@@ -333,113 +302,6 @@ def _check_time(epoch):
         raise ValueError(msg)
 
 
-@dataclass(frozen=True, eq=False)
-class Detections:
-    """
-    What an epoch says about each of its n rows, as plain arrays.
-
-    For n stars at E epochs the arrays have an axis of epochs before the
-    last, but ``ids`` (n,) are the names of the stars, and ``flux`` and
-    ``radial_velocity`` (n,) [km/s] their means.
-
-    ``plane`` (2, n) and ``covariance`` (3, n: xx, xy, yy) are in the frame's
-    unit, mas or pixels. ``found`` says which positions are finite,
-    ``usable`` which errors are good as well.
-    """
-
-    ids: np.ndarray | None
-    plane: np.ndarray
-    covariance: np.ndarray
-    years: np.ndarray
-    flux: np.ndarray
-    radial_velocity: np.ndarray
-    found: np.ndarray
-    usable: np.ndarray
-    chip: np.ndarray | None = None
-
-
-def numbers(table, key, unit=None):
-    """
-    Return a column as float64; NaN where masked, infinite or missing.
-
-    A column without unit is taken to be in ``unit``.
-    """
-    values = first_values(table, names_of(key), unit)
-    return np.where(np.isfinite(values), values, np.nan)
-
-
-def sky_vectors(epoch):
-    """Return ICRS unit vectors (3, n) of an epoch with sky positions."""
-    if epoch.is_pixels:
-        x, y = pixels(epoch)
-        vectors = (pixel_to_vectors(epoch.wcs, x, y) if epoch.chips is None
-                   else chip_vectors(epoch, x, y))
-    else:
-        vectors = table_vectors(epoch.table)
-    if epoch.is_scan:
-        vectors = _along_the_scan(epoch.table, vectors)
-    velocity = observer_velocity(epoch.observer)
-    if velocity is None:
-        return vectors
-    return remove_aberration(vectors, velocity)
-
-
-def _along_the_scan(table, vectors):
-    """Return directions (3, n) moved along the scans by what was measured."""
-    east, north = local_axes(vectors)
-    sine, cosine = _scan_directions(table)
-    step = numbers(table, 'along', u.mas) / MAS
-    moved = vectors + step * (sine * east + cosine * north)
-    return moved / np.sqrt(1 + step**2)
-
-
-def _scan_directions(table):
-    angle = np.radians(numbers(table, 'scan_angle', u.deg))
-    return np.sin(angle), np.cos(angle)
-
-
-def _scan_covariance(table):
-    """Return xx, xy, yy of scans, which say nothing across their way."""
-    error = numbers(table, 'along_err', u.mas)
-    sine, cosine = _scan_directions(table)
-    across = (ACROSS * error)**2
-    along = error**2 - across
-    covariance = np.stack([across + along * sine**2, along * sine * cosine,
-                           across + along * cosine**2])
-    return np.where((error > 0) & np.isfinite(error + sine), covariance,
-                    np.nan)
-
-
-def table_vectors(table):
-    """Return ICRS unit vectors (3, n) of ra and dec, NaN for no places."""
-    dec = numbers(table, 'dec', u.deg)
-    return unit_vectors(numbers(table, 'ra', u.deg),
-                        np.where(np.abs(dec) <= 90, dec, np.nan))
-
-
-def brightness(table):
-    """Return numbers (n,) that grow with the flux, NaN where unknown."""
-    for key, sign in (('flux', 1), ('magnitude', -1)):
-        values = numbers(table, key)
-        if np.isfinite(values).any():
-            return sign * values
-    return values
-
-
-def magnitudes(table):
-    """Return magnitudes (n,), from fluxes if need be, NaN where unknown."""
-    values = brightness(table)
-    if find_column(table, names_of('flux')) is None:
-        return -values
-    with np.errstate(invalid='ignore', divide='ignore'):
-        return np.where(values > 0, -2.5 * np.log10(values), np.nan)
-
-
-def pixels(epoch):
-    """Return x and y [pix] of an epoch."""
-    return numbers(epoch.table, 'x', u.pix), numbers(epoch.table, 'y', u.pix)
-
-
 def check_epochs(epochs):
     """Return the epochs as a list, or raise for what are none."""
     if isinstance(epochs, Epoch):
@@ -455,145 +317,3 @@ def check_epochs(epochs):
         msg = 'epochs must be at least 2, got 0'
         raise ValueError(msg)
     return epochs
-
-
-def read_epochs(epochs, references=None, *, turns=None):
-    """
-    Return what epochs say, in one plane.
-
-    Parameters
-    ----------
-    epochs : list of `Epoch`
-    references : `~astropy.table.Table`, optional
-        Reference objects, whose unit counts where nothing is on the sky.
-    turns : list of (3, 3) `~numpy.ndarray` or None, optional
-        Rotations of the sphere that correct pointings, None for those that
-        are right.
-
-    Returns
-    -------
-    detections : list of `Detections`
-    plane : `~photutils_mgauss.sky.tangent_plane.TangentPlane` or None
-        None where nothing is known about the sky.
-    unit : {'mas', 'pix'}
-    """
-    vectors = [sky_vectors(epoch) if epoch.is_sky else None
-               for epoch in epochs]
-    if turns is not None:
-        vectors = [vector if turn is None else turn @ vector
-                   for vector, turn in zip(vectors, turns, strict=True)]
-    plane = _common_plane(vectors)
-    unit = 'mas' if plane else _common_unit(epochs, references)
-    # Popped, so that a million directions are kept no longer than needed.
-    turns = [None] * len(epochs) if turns is None else turns
-    detections = [read_epoch(epoch, plane, vectors.pop(0), turn)
-                  for epoch, turn in zip(epochs, turns, strict=True)]
-    return detections, plane, unit
-
-
-def _common_plane(vectors):
-    """Return the plane at the mean direction, None if there is no sky."""
-    seen = [vector for vector in vectors if vector is not None]
-    if not seen:
-        return None
-    total = sum(np.nansum(vector, axis=1) for vector in seen)
-    if not total.any():
-        msg = ('epochs must have finite positions, got none inside the '
-               'bounding boxes of their WCS')
-        raise ValueError(msg)
-    return TangentPlane.around(total)
-
-
-def _common_unit(epochs, references):
-    if references is not None and 'x' in references.colnames:
-        unit = getattr(references['x'], 'unit', None)
-        if unit is not None and unit.physical_type == 'angle':
-            return 'mas'
-    units = {epoch.plane_unit for epoch in epochs}
-    if len(units) > 1:
-        msg = ('epochs must all have a scale or none, got columns in '
-               'pixels and in angles; give pixel_scale')
-        raise ValueError(msg)
-    return units.pop()
-
-
-def read_epoch(epoch, plane=None, vectors=None, turn=None):
-    """
-    Return the `Detections` of an epoch.
-
-    ``plane`` is the common `TangentPlane`, and ``vectors`` the directions
-    already computed; both None where nothing is known about the sky.
-    ``turn`` is the rotation (3, 3) they had, if any.
-    """
-    years = np.asarray(epoch.years, dtype=float)
-    ids, flux = _ids(epoch.table), numbers(epoch.table, 'flux')
-    velocity = numbers(epoch.table, 'radial_velocity', u.km / u.s)
-    if vectors is None:
-        positions, covariance = _read_plane(epoch)
-    else:
-        positions = plane.project(vectors)
-        covariance = _sky_covariance(epoch, plane, positions, turn)
-    found = np.isfinite(positions).all(axis=0) & np.isfinite(years)
-    return Detections(ids, np.where(found, positions, np.nan), covariance,
-                      years, flux, velocity, found,
-                      found & is_definite_2x2(covariance),
-                      None if epoch.chips is None
-                      else np.asarray(epoch.table['chip']))
-
-
-def _read_plane(epoch):
-    size = epoch.pixel_size
-    unit, scale = (u.mas, 1.0) if size is None else (u.pix, size)
-    x, y, dx, dy = (scale * numbers(epoch.table, key, unit)
-                    for key in ('x', 'y', 'x_err', 'y_err'))
-    covariance = _covariance(epoch.table, dx, dy, scale**2, unit**2)
-    return np.stack([x, y]), covariance
-
-
-def _covariance(table, dx, dy, scale=1.0, unit=u.pix**2):
-    """Return xx, xy, yy; errors that are not positive become NaN."""
-    cross = np.zeros_like(dx)
-    if 'xy_cov' in table.colnames:
-        cross = scale * numbers(table, 'xy_cov', unit)
-    good = (dx > 0) & (dy > 0) & np.isfinite(dx) & np.isfinite(dy)
-    return np.where(good, np.stack([dx * dx, cross, dy * dy]), np.nan)
-
-
-def _sky_covariance(epoch, plane, positions, turn):
-    """Carry the errors of pixels or sky positions to the plane."""
-    keys, unit = (('x_err', 'y_err'), u.pix) if epoch.is_pixels else (
-        ('ra_err', 'dec_err'), u.mas)
-    if epoch.is_scan:
-        covariance = _scan_covariance(epoch.table)
-    else:
-        errors = (numbers(epoch.table, key, unit) for key in keys)
-        covariance = _covariance(epoch.table, *errors, unit=unit**2)
-    if epoch.is_pixels:
-        x, y = pixels(epoch)
-        jacobian = (pixel_jacobian(epoch.wcs, plane, x, y, turn)
-                    if epoch.chips is None
-                    else chip_jacobian(epoch, plane, x, y, turn))
-    elif turn is None:
-        jacobian = plane.local_jacobian(positions)
-    else:  # The errors are along east and north as the table has them.
-        axes = local_axes(turn.T @ plane.deproject(positions))
-        jacobian = np.stack([plane.displacement(
-            positions, np.tensordot(turn, axis, axes=1)) for axis in axes],
-            axis=1)
-    return sandwich_2x2(jacobian, covariance)
-
-
-def _ids(table):
-    if 'id' not in table.colnames:
-        return None
-    if np.any(getattr(table['id'], 'mask', False)):
-        msg = "the column 'id' must not have masked values"
-        raise ValueError(msg)
-    ids = np.asarray(table['id'])
-    values, counts = np.unique(ids, return_counts=True)
-    if len(values) < len(ids):
-        msg = (f"the column 'id' must hold unique values, got "
-               f'{values[counts > 1][0]!r} {counts.max()} times')
-        raise ValueError(msg)
-    return ids
-

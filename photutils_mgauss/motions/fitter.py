@@ -181,7 +181,7 @@ class ProperMotionFitter:
         options = self._options()
         with waiting('ProperMotionFitter.fit'):
             sightings = assemble(epochs, self.references, self._how_to_match(),
-                                 options.transform)
+                                 options.transform, options.wanted)
             setup, state = prepare(sightings, options)
             result = (fit(setup, state) if options.recipe != 'paper'
                       else fit_paper(setup, state))

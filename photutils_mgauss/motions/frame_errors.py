@@ -11,6 +11,8 @@ from photutils_mgauss.utils.star_columns import check_table
 # The columns of the table, of which those of all epochs are the same.
 _PLANE = 'plane_ra', 'plane_dec'
 _BASIS = 'degree', 'centre', 'scale'
+# Epochs are told apart by their times to this much [yr].
+_SAME_TIME = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +55,31 @@ class FrameErrors:
                    factor.reshape(n, 2, -1, factor.shape[1]),
                    fit.setup.sightings.plane, fit.setup.transform,
                    bool(fit.setup.relative))
+
+    def epochs_at(self, years):
+        """Return the numbers of the epochs (E,) at which images were taken."""
+        found = []
+        for k, year in enumerate(years):
+            away = np.abs(self.years - year)
+            e = int(np.argmin(away))
+            if len(self.years) == len(years) and away[k] == away[e]:
+                e = k
+            if away[e] > _SAME_TIME:
+                msg = ('references must be a MotionSolution of the epochs of '
+                       f'the images, got none at {year:.6f}, the time of '
+                       f'image {k}')
+                raise ValueError(msg)
+            found.append(e)
+        return found
+
+    def moves(self, epoch, place):
+        """
+        Return how far places in the plane (2, n) move (n, 2, q) [mas].
+
+        By each of the q independent errors of standard deviation 1.
+        """
+        basis = np.nan_to_num(self.transform.basis(place))
+        return np.einsum('xbq,bn->nxq', self.factor[epoch], basis)
 
     def to_table(self):
         """Return them as a table, one row for each epoch."""

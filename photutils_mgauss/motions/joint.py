@@ -371,7 +371,7 @@ def _project(stars, e, c):
 
 
 def solve_all(problem, correction, factor, executor=None, *, only=None,
-              **wanted):
+              residuals_of=None, **wanted):
     """
     Return the `Estimates` of all stars of a problem with the frames found.
 
@@ -385,6 +385,9 @@ def solve_all(problem, correction, factor, executor=None, *, only=None,
     executor : `~concurrent.futures.Executor`, optional
     only : sequence of str, optional
         The fields of `Estimates` that are kept, where not all are needed.
+    residuals_of : (k,) int `~numpy.ndarray`, optional
+        The sorted numbers of the stars whose residuals are kept, where not
+        all are needed.
     **wanted
         ``residuals``, ``leverage`` and ``judge``: whether to return the
         residuals, what the fit took away of their covariance, and what the
@@ -392,16 +395,24 @@ def solve_all(problem, correction, factor, executor=None, *, only=None,
     """
     solve = partial(solve_stars, correction=correction,
                     inverse=factor @ factor.T, **wanted)
-    whole, start = None, 0
+    whole, own, start = None, None, 0
+    if residuals_of is not None:
+        own = np.empty((*problem.offsets.shape[:2], len(residuals_of)))
     # Parts go as they come, or all arrays would be there twice.
     for part in each_part(solve, problem, executor):
+        stop = start + part.values.shape[1]
+        if own is not None:
+            some = slice(*np.searchsorted(residuals_of, [start, stop]))
+            own[..., some] = part.residuals[..., residuals_of[some] - start]
         if whole is None:
             whole = _for_all(part, problem.n_stars, only)
-        stop = start + part.values.shape[1]
+            if own is not None:
+                whole.pop('residuals')
         for name, array in whole.items():
             array[..., start:stop] = getattr(part, name)
         start = stop
-    return Estimates(**dict.fromkeys(('values', 'covariance')) | whole)
+    return Estimates(**dict.fromkeys(('values', 'covariance'))
+                     | {'residuals': own} | whole)
 
 
 def _for_all(part, n, only):

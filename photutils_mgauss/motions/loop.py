@@ -23,7 +23,6 @@ from photutils_mgauss.motions.joint import (
     parallax_leak,
     reduce_all,
     solve_all,
-    total_chi2,
 )
 from photutils_mgauss.motions.perspective import swerved
 from photutils_mgauss.motions.prepare import Setup, State
@@ -107,16 +106,15 @@ class Fit:
 
 
 def finished(setup, state, problem, frames, estimates, pose_again):
-    """Return the `Fit` with these estimates of its stars."""
-    chi2 = total_chi2(problem, estimates)
+    """Return the `Fit` with these `last_estimates` of its stars."""
     observer, leak = setup.sightings.observer, None
     if observer is not None and not setup.options.parallax:
         leak = parallax_leak(replace(problem, observer=observer),
                              setup.options.executor)
     rms = _reference_rms(setup, state, estimates.residuals)
     return Fit(setup, state, pose_again, frames,
-               replace(estimates, residuals=None), rms, chi2, problem.ranks,
-               leak)
+               replace(estimates, residuals=None), rms, estimates.total,
+               problem.ranks, leak)
 
 
 def references_in_use(setup, state):
@@ -126,9 +124,15 @@ def references_in_use(setup, state):
     return stars
 
 
+def last_estimates(setup, state, problem, frames):
+    """Return the `Estimates`, with residuals of the references in use."""
+    return solve(setup, problem, frames, residuals=True, residuals_of=(
+        np.flatnonzero(references_in_use(setup, state))))
+
+
 def _reference_rms(setup, state, residuals):
-    """Return the rms (E, 2) of the residuals of references."""
-    used = state.used & references_in_use(setup, state)
+    """Return the rms (E, 2) of the residuals of the references in use."""
+    used = state.used[:, references_in_use(setup, state)]
     used &= np.isfinite(residuals).all(axis=0)
     return np.array([
         np.sqrt(np.mean(residuals[:, e, own]**2, axis=1))
@@ -183,14 +187,18 @@ def _ties(setup, state):
 
 def _step(setup, state):
     """Solve for the frames once; return problem, frames and new maps."""
-    problem = pose(setup, state)
+    problem, back = pose(setup, state), None
     if setup.transform.n_parameters == 0:
         frames = fixed_frames(problem)
-    elif setup.distortion is None:
-        reduced = reduce_all(problem, setup.options.executor)
-        frames = solve_frames(problem, reduced, relative=setup.relative)
     else:
-        frames, state = _solve_chips(setup, state, problem)
+        reduced = reduce_all(problem, setup.options.executor)
+        if setup.distortion is not None:
+            reduced, back = without_chips(reduced, reduce_chips(
+                problem, setup.distortion, state.distortion))
+        frames = solve_frames(problem, reduced, relative=setup.relative)
+    if back is not None:
+        change = back(frames.correction).reshape(state.distortion.shape)
+        state = replace(state, distortion=state.distortion + change)
     maps = np.stack([setup.transform.project(one)
                      for one in state.maps + frames.correction])
     swerve = state.swerve
@@ -200,19 +208,9 @@ def _step(setup, state):
     return problem, frames, replace(state, maps=maps, swerve=swerve)
 
 
-def _solve_chips(setup, state, problem):
-    """Return the frames, and the state with new polynomials of chips."""
-    chips = reduce_chips(problem, setup.distortion, state.distortion)
-    reduced, back = without_chips(
-        reduce_all(problem, setup.options.executor), chips)
-    frames = solve_frames(problem, reduced, relative=setup.relative)
-    change = back(frames.correction).reshape(state.distortion.shape)
-    return frames, replace(state, distortion=state.distortion + change)
-
-
 def _align(setup, state):
     """Iterate until the maps stand still."""
-    before, typical = np.inf, np.sqrt(setup.typical_variance)
+    before, typical = np.inf, np.sqrt(setup.sightings.typical_variance)
     for i in range(MAX_ITERATIONS):
         problem = frames = None  # as large as all that was measured
         problem, frames, after = _step(setup, state)
@@ -244,7 +242,7 @@ def fit(setup, state):
         problem, frames, state = _align(setup, after)
         if still:
             break
-    estimates = solve(setup, problem, frames, residuals=True)
+    estimates = last_estimates(setup, state, problem, frames)
     if setup.relative and setup.transform.kind != 'none':
         estimates, common = remove_mean_fields(problem, frames, estimates,
                                                setup.options)
@@ -296,7 +294,8 @@ def measured_alone(result):
     if result.setup.relative:
         return result
     problem = result.problem.unbound
-    estimates = solve(result.setup, problem, result.frames, residuals=True)
+    estimates = last_estimates(result.setup, result.state, problem,
+                               result.frames)
     return finished(result.setup, result.state, problem, result.frames,
                     estimates, lambda: result.problem.unbound)
 
@@ -324,7 +323,7 @@ def _review(setup, state, problem, frames):
     each = _measured_numbers(problem)
     bad = worst_outliers(estimates.chi2, state.used,
                          _spare(problem, each) & ~state.crooked,
-                         chi2_limits(setup.options.clip, each))
+                         setup.options.clip, each)
     if bad.any():
         return _rejected(setup, state, bad), True
     untied = state.untied | _inconsistent(setup, problem, estimates)
@@ -334,8 +333,11 @@ def _review(setup, state, problem, frames):
 
 def _measured_numbers(problem):
     """Return how many numbers each detection measures, (E, n)."""
-    return np.where(problem.weights[0] + problem.weights[2] > 0,
-                    dimensions_2x2(problem.weights), 0)
+    out = np.zeros(problem.weights.shape[1:], dtype=np.int8)
+    for e in range(problem.n_epochs):
+        weights = problem.weights[:, e]
+        out[e] = dimensions_2x2(weights) * (weights[0] + weights[2] > 0)
+    return out
 
 
 def _rejected(setup, state, bad):
@@ -415,7 +417,7 @@ def _barely_known(setup, problem, frames, which):
     """
     some = problem.unbound.select(np.flatnonzero(which))
     missing = some.n_parameters - measured_ranks(some)
-    sigma = WEAK * np.sqrt(setup.typical_variance)
+    sigma = WEAK * np.sqrt(setup.sightings.typical_variance)
     weak = replace(some, priors=weak_priors(some.n_stars, some.n_parameters,
                                             sigma))
     return solve(setup, weak, frames, residuals=True).total, missing
@@ -425,7 +427,7 @@ def _moved(setup, state, after, part):
     """Return whether errors have changed by more than a part of them."""
     if after.scales is None:
         return (np.abs(after.floor - state.floor) > part * state.floor + (
-            part / 10) * setup.typical_variance).any()
+            part / 10) * setup.sightings.typical_variance).any()
     used = state.used
     change = [np.log(variance_2x2(measured(setup, after, e)[:, used[e]])
                      / variance_2x2(measured(setup, state, e)[:, used[e]]))
@@ -470,23 +472,22 @@ def chi2_limit(clip, dof):
     return chdtri(dof, 2 * ndtr(-clip))
 
 
-def chi2_limits(clip, dimensions):
-    """Return the `chi2_limit` of 1 or 2 degrees of freedom for each."""
-    one, two = chi2_limit(clip, np.array([1, 2]))
-    return np.where(dimensions == 1, one, two)
-
-
-def worst_outliers(chi2, used, spare, limit):
+def worst_outliers(chi2, used, spare, clip, dimensions):
     """
     Return which detections to reject now, (E, n): each star's worst.
 
-    The worst is farthest beyond the ``limit`` (E, n) of its chi-square.
+    The worst is farthest beyond the `chi2_limit` of its chi-square, which
+    has 1 or 2 ``dimensions`` (E, n).
 
     Only one of a star's goes at a time, or a twentieth of many, because a
     bad one spoils the residuals of the good; and only where ``spare`` (n,)
     says the star has detections enough to tell the bad one.
     """
-    excess = np.where(used, np.nan_to_num(chi2, nan=0.0), 0.0) / limit
+    excess = np.nan_to_num(chi2, nan=0.0)
+    excess[~used] = 0.0
+    one, two = chi2_limit(clip, np.array([1, 2]))
+    for e, numbers in enumerate(dimensions):
+        excess[e] /= np.where(numbers == 1, one, two)
     worst = excess.argmax(axis=0)
     out = np.zeros(used.shape, dtype=bool)
     stars = np.arange(used.shape[1])

@@ -3,20 +3,19 @@ Which rows of several exposures are the same star.
 
 Rows are matched by an identifier, or by position (``pairing``).
 """
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import astropy.units as u
 import numpy as np
 
 from photutils_mgauss.motions.baseline import COMMON
-from photutils_mgauss.motions.epoch import Detections
+from photutils_mgauss.motions.detections import Detections
 from photutils_mgauss.motions.pairing import (
     Known,
     Matches,
     Tolerance,
     match_positions,
 )
-from photutils_mgauss.motions.stacked import variance_2x2
 from photutils_mgauss.sky.space_motion import NO_ERROR
 
 POINTING = 2000.0  # mas: offsets of exposures that are looked for
@@ -77,7 +76,8 @@ def match_epochs(detections, on_sky, catalogue, how, unit, orient):
 
     Parameters
     ----------
-    detections : list of `~photutils_mgauss.motions.epoch.Detections`
+    detections : list of `~photutils_mgauss.motions.detections.Detections`
+        Of which none are left in the end: those of all stars take over.
     on_sky : bool
         Whether all epochs have places in the sky.
     catalogue : `~photutils_mgauss.motions.references.Catalogue` or None
@@ -90,7 +90,7 @@ def match_epochs(detections, on_sky, catalogue, how, unit, orient):
 
     Returns
     -------
-    every : `~photutils_mgauss.motions.epoch.Detections`
+    every : `~photutils_mgauss.motions.detections.Detections`
         Those of all n stars at E epochs, and the names of the stars.
     matches : `Matches`
         Every star is in some epoch.
@@ -111,27 +111,48 @@ def match_epochs(detections, on_sky, catalogue, how, unit, orient):
 
 
 def _stack(matches, names, detections):
-    """Return the `Detections` of all stars at all epochs."""
+    """Return the `Detections` of all stars at all epochs, using them up."""
+    lists = {field.name: [getattr(one, field.name) for one in detections]
+             for field in fields(Detections)}
+    # One kind after another goes, or all that was read would be there twice.
+    detections.clear()
+
     def take(name, fill=np.nan):
-        return matches.take([getattr(one, name) for one in detections], fill)
-    years = [one.years for one in detections]
+        return matches.take(lists.pop(name), fill)
+    n = len(names)
+    return Detections(
+        names, covariance=take('covariance'), plane=take('plane'),
+        years=_stacked_years(matches, lists.pop('years'), lists['found']),
+        found=take('found', False), usable=take('usable', False),
+        flux=_mean(take('flux'), n),
+        radial_velocity=_mean(take('radial_velocity'), n),
+        velocity_error=_largest(take('velocity_error'), n),
+        magnitude=take('magnitude'), colour=take('colour'),
+        chip=take('chip', -1), pixels=take('pixels'),
+        jacobian=take('jacobian'))
+
+
+def _stacked_years(matches, years, found):
+    """Return years (E, 1), or (E, n) where rows have times of their own."""
     if all(year.ndim == 0 for year in years):
-        years = np.array(years)[:, None]
-    else:
-        years = matches.take([
-            np.broadcast_to(year, one.found.shape)
-            for year, one in zip(years, detections, strict=True)])
-    return Detections(names, take('plane'), take('covariance'), years,
-                      _mean(take('flux')), _mean(take('radial_velocity')),
-                      take('found', False), take('usable', False))
+        return np.array(years)[:, None]
+    return matches.take([np.broadcast_to(year, one.shape)
+                         for year, one in zip(years, found, strict=True)])
 
 
-def _mean(values):
+def _mean(values, n):
     """Return the means (n,) of what is known of stars at E epochs."""
+    if values is None:
+        return np.full(n, np.nan)
     known = np.isfinite(values)
     count = known.sum(axis=0)
     return (np.where(known, values, 0.0).sum(axis=0)
             / np.where(count, count, np.nan))
+
+
+def _largest(values, n):
+    """Return the largest (n,) of what is known of stars at E epochs."""
+    return np.full(n, np.nan) if values is None else np.fmax.reduce(values)
 
 
 def _is_by_id(detections, on_sky, how, unit):
@@ -235,7 +256,7 @@ def _match_turned(detections, known, tolerance, maps):
     years = [float(np.nanmean(one.years)) for one in detections]
     places, sigmas, reach = [], [], 0.0
     for one, found in zip(detections, maps, strict=True):
-        sigma = np.sqrt(variance_2x2(one.covariance))
+        sigma = one.sigma
         if found is not None:
             sigma *= np.sqrt(abs(np.linalg.det(found.matrix[:, 1:])))
             reach = max(reach, found.reach)
@@ -312,13 +333,12 @@ def find_references(catalogue, detections, years, tolerance):
     """
     if catalogue.ids is not None:
         return _lookup(catalogue.ids, detections.ids)
-    found = np.full(len(catalogue.kinds), -1)
+    found, sigma = np.full(len(catalogue.kinds), -1), detections.sigma
     for e, year in enumerate(years):
         # Epoch by epoch: frames that differ would blur a star's mean place.
         known = _known(catalogue, year)
-        sigma = np.sqrt(variance_2x2(detections.covariance[:, e]))
-        matches = match_positions([detections.plane[:, e]], [sigma], [year],
-                                  tolerance, known)
+        matches = match_positions([detections.plane[:, e]], [sigma[e]],
+                                  [year], tolerance, known)
         stars = matches.rows[0, :len(found)]
         new = (found < 0) & ~np.isin(stars, found)
         found[new] = stars[new]

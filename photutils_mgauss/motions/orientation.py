@@ -9,11 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photutils_mgauss.motions.epoch import (
-    brightness,
-    sky_vectors,
-    table_vectors,
-)
+from photutils_mgauss.motions.columns import brightness
 from photutils_mgauss.sky.patterns import ENOUGH, Pattern, within
 from photutils_mgauss.sky.tangent_plane import MAS, TangentPlane, local_axes
 
@@ -37,21 +33,23 @@ class Objects:
         return cls(places[:, good], flux[good])
 
 
-def find_turns(epochs, references):
+def find_turns(lists, targets):
     """
     Return the rotations (3, 3) of epochs on the sky, and sentences on them.
 
     None for epochs whose pointing is right, and for those without a sky.
-    Right is what references with positions say, or else the first epoch.
+    Right is what targets say, or else the first epoch.
+
+    Parameters
+    ----------
+    lists : list of `Objects` or None
+        The directions of all epochs, None for those without a sky.
+    targets : list of `Objects`
+        Directions that are known to be right.
     """
-    lists = {e: Objects.of(sky_vectors(epoch), brightness(epoch.table))
-             for e, epoch in enumerate(epochs) if epoch.is_sky}
-    targets = []
-    if references is not None and 'ra' in references.colnames:
-        targets = [Objects.of(table_vectors(references),
-                              brightness(references))]
-    found = _one_after_another(lists, targets, _turn_between, np.matmul)
-    turns, notes = [None] * len(epochs), []
+    on_sky = {e: one for e, one in enumerate(lists) if one is not None}
+    found = _one_after_another(on_sky, targets, _turn_between, np.matmul)
+    turns, notes = [None] * len(lists), []
     for e, turn in sorted(found.items()):
         away = 0.0 if turn is None else _displacement(turn, lists[e].places)
         if np.max(away) > RIGHT:
@@ -143,7 +141,7 @@ def find_maps(epochs, detections, catalogue, flux):
     Parameters
     ----------
     epochs : list of `~photutils_mgauss.motions.epoch.Epoch`
-    detections : list of `~photutils_mgauss.motions.epoch.Detections`
+    detections : list of `~photutils_mgauss.motions.detections.Detections`
         Of the epochs.
     catalogue : `~photutils_mgauss.motions.references.Catalogue` or None
         Reference objects, and their ``flux`` (k,).

@@ -46,16 +46,21 @@ class Matches:
         """
         Return one array per exposure, (..., n_e), as (..., E, n).
 
-        Missing rows are filled with ``fill``.
+        Missing rows, and exposures whose array is None, are filled with
+        ``fill``; None where all arrays are.
         """
-        leading = values[0].shape[:-1]
-        kind = np.result_type(*values, type(fill))
-        out = np.empty((*leading, *self.rows.shape), dtype=kind)
+        known = [value for value in values if value is not None]
+        if not known:
+            return None
+        kind = np.result_type(*known, type(fill))
+        out = np.empty((*known[0].shape[:-1], *self.rows.shape), kind)
         for e, (value, rows) in enumerate(
                 zip(values, self.rows, strict=True)):
-            if value.shape[-1]:
+            if value is None or not value.shape[-1]:
+                out[..., e, :] = fill
+            else:
                 out[..., e, :] = value[..., rows]
-            out[..., e, rows < 0] = fill
+                out[..., e, rows < 0] = fill
         return out
 
 

@@ -20,7 +20,7 @@ from functools import partial
 import numpy as np
 
 from photutils_mgauss.motions.frames import MOTIONS, POSITIONS, Frames
-from photutils_mgauss.motions.loop import finished, pose, solve
+from photutils_mgauss.motions.loop import finished, last_estimates, pose
 from photutils_mgauss.motions.priors import Priors
 
 
@@ -95,7 +95,7 @@ def fit_paper(setup, state):
     notes = (POSITIONS, MOTIONS.format(field=''))
     frames = Frames(np.zeros_like(maps), empty,
                     notes if setup.relative else notes[:1])
-    estimates = solve(setup, problem, frames, residuals=True)
+    estimates = last_estimates(setup, state, problem, frames)
     return finished(setup, state, problem, frames, estimates,
                     partial(_pose, setup, state))
 

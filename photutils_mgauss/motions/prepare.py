@@ -6,8 +6,7 @@ import astropy.units as u
 import numpy as np
 
 from photutils_mgauss.motions.assemble import Sightings
-from photutils_mgauss.motions.chips import Distortion, distortion_of
-from photutils_mgauss.motions.epoch import magnitudes, numbers, pixels
+from photutils_mgauss.motions.distortion import Distortion, distortion_of
 from photutils_mgauss.motions.error_scale import ErrorScales
 from photutils_mgauss.motions.perspective import Nearing
 from photutils_mgauss.motions.priors import (
@@ -15,7 +14,6 @@ from photutils_mgauss.motions.priors import (
     add_parallax_prior,
     build_priors,
 )
-from photutils_mgauss.motions.stacked import variance_2x2
 from photutils_mgauss.motions.terms import Terms, terms_of
 from photutils_mgauss.sky.transforms import Transform
 from photutils_mgauss.utils.validation import as_rng
@@ -56,6 +54,14 @@ class Options:
         """Whether errors are scaled, too, as functions of magnitude."""
         return self.fits_floor and self.systematic == 'magnitude'
 
+    @property
+    def wanted(self):
+        """What of detections is needed besides places, errors and times."""
+        return {name for name, needed in (
+            ('magnitude', self.scales_errors or self.terms),
+            ('colour', 'colour' in self.terms), ('pixels', self.terms))
+            if needed}
+
 
 @dataclass(frozen=True, eq=False)
 class Setup:
@@ -92,11 +98,9 @@ class Setup:
         Stars of known radial velocity.
     notes : tuple of str
         What could not be used, in sentences.
-    typical_variance : float
-        Median variance of the detections, 1 if there are none.
     magnitudes : (E, n) `~numpy.ndarray` or None
         Of the detections, if something depends on them.
-    distortion : `~photutils_mgauss.motions.chips.Distortion` or None
+    distortion : `~photutils_mgauss.motions.distortion.Distortion` or None
         Of the chips of cameras, if there are any, or the terms in use.
     terms : `~photutils_mgauss.motions.terms.Terms` or None
         Those asked for, until it is known which are real.
@@ -116,7 +120,6 @@ class Setup:
     drift: tuple | None
     nearing: Nearing
     notes: tuple
-    typical_variance: float
     magnitudes: np.ndarray | None
     distortion: Distortion | None
     terms: Terms | None
@@ -186,17 +189,15 @@ def prepare(sightings, options):
     if options.parallax == 'prior':
         priors = add_parallax_prior(priors, len(anchors),
                                     options.parallax_prior)
-    variance = variance_2x2(sightings.covariance[:, sightings.usable])
     maps = np.repeat(transform.identity()[None], len(dt), axis=0)
-    brightness = (magnitudes_of(sightings)
-                  if options.scales_errors or options.terms else None)
-    typical = np.median(variance) if variance.size else 1.0
-    distortion = distortion_of(sightings, pixels, options.distortion,
+    magnitudes = (None if sightings.magnitude is None
+                  else in_one_system(sightings.magnitude))
+    distortion = distortion_of(sightings, options.distortion,
                                options.distortion_prior.to_value(u.mas))
-    terms = _terms(sightings, options, brightness, distortion, typical)
+    terms = terms_of(sightings, options, magnitudes)
     return (Setup(sightings, options, transform, origin, working, dt, priors,
                   places, anchors, held, relative, drift, nearing, notes,
-                  typical, brightness, distortion, terms),
+                  magnitudes, distortion, terms),
             State(maps, sightings.usable.copy(), floor,
                   np.empty(0, dtype=int), untied,
                   np.zeros((2, len(dt), len(nearing.stars))),
@@ -204,29 +205,12 @@ def prepare(sightings, options):
                   distortion=distortion and distortion.none()))
 
 
-def _terms(sightings, options, brightness, distortion, typical):
-    """Return the `Terms` asked for, None if there are none."""
-    if not options.terms:
-        return None
-    if distortion is not None:
-        msg = ('distortion must be None for terms of epochs of chips, got '
-               f'{options.distortion.kind!r}: one fit finds either of them')
-        raise ValueError(msg)
-    if options.transform.kind == 'none' or options.recipe == 'paper':
-        msg = ('terms need maps between the epochs: give a transform, and '
-               "the recipe 'joint' or 'two-step'")
-        raise ValueError(msg)
-    return terms_of(sightings, options.terms, brightness, np.sqrt(typical))
-
-
-def magnitudes_of(sightings):
+def in_one_system(each):
     """
     Return the magnitudes (E, n) of detections, in the mean system.
 
     Where an epoch has none, it is that of the others.
     """
-    each = sightings.matches.take([magnitudes(epoch.table)
-                                   for epoch in sightings.epochs])
     if not np.isfinite(each).any():
         msg = ('epochs must have a column of magnitudes or fluxes (mag or '
                "flux_fit) for systematic='magnitude' and terms, got none")
@@ -238,7 +222,7 @@ def magnitudes_of(sightings):
         for _ in range(3):
             mean = np.nanmedian(each - zero, axis=0)
             zero = np.nan_to_num(np.nanmedian(each - mean, axis=1))[:, None]
-    each -= zero - zero.mean()
+    each = each - (zero - zero.mean())
     return np.where(np.isfinite(each), each, mean + zero.mean())
 
 
@@ -374,7 +358,7 @@ def _nearing(sightings, options):
     use = known & (np.isfinite(parallax) | bool(options.parallax))
     stars, left = np.flatnonzero(use), np.sum(known & ~use)
     nearing = Nearing(stars, sightings.radial_velocity[stars],
-                      np.nan_to_num(_velocity_errors(sightings)[stars]),
+                      np.nan_to_num(sightings.velocity_error[stars]),
                       np.nan_to_num(parallax[stars]))
     if not left:
         return nearing, ()
@@ -382,18 +366,6 @@ def _nearing(sightings, options):
     note = (f'The radial velocity of {of} is not used, because the parallax '
             'is not known: give references with parallaxes, or fit them.')
     return nearing, (note,)
-
-
-def _velocity_errors(sightings):
-    """Return the errors (n,) of radial velocities [km/s], NaN if unknown."""
-    each = sightings.matches.take([
-        numbers(epoch.table, 'radial_velocity_error', u.km / u.s)
-        for epoch in sightings.epochs])
-    out = np.fmax.reduce(each, axis=0)
-    stars, catalogue = sightings.references, sightings.catalogue
-    out[stars] = np.where(np.isfinite(catalogue.radial_velocity),
-                          catalogue.velocity_error, out[stars])
-    return out
 
 
 def _drift(sightings, origin, options):

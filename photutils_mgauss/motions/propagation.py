@@ -17,19 +17,26 @@ def propagated(fit, year):
     """
     Return parameters (p, n) and covariances of all stars, in local axes.
 
-    In parts, since the matrices that turn the axes are as large as the
-    covariances themselves.
+    At a Julian year, as do all in this module.
     """
-    plane = fit.setup.sightings.plane
     values = np.empty_like(fit.estimates.values)
     covariance = np.empty_like(fit.estimates.covariance)
-    for start in range(0, values.shape[1], CHUNK):
-        some = slice(start, start + CHUNK)
-        moved = at_epoch(fit, year, some)
-        if plane is not None:
-            moved = turned(plane, *moved)
+    for some, *moved in propagated_parts(fit, year):
         values[:, some], covariance[..., some] = moved
     return values, covariance
+
+
+def propagated_parts(fit, year):
+    """
+    Yield the same for some stars after others, and which these are.
+
+    The covariances of all are the largest of all arrays of stars.
+    """
+    plane = fit.setup.sightings.plane
+    for start in range(0, fit.n_stars, CHUNK):
+        some = slice(start, start + CHUNK)
+        moved = at_epoch(fit, year, some)
+        yield some, *(moved if plane is None else turned(plane, *moved))
 
 
 def at_epoch(fit, year, stars):

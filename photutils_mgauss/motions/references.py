@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import astropy.units as u
 import numpy as np
 
-from photutils_mgauss.motions.epoch import (
+from photutils_mgauss.motions.columns import (
     names_of,
     numbers,
     table_vectors,

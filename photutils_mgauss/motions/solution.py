@@ -21,6 +21,7 @@ from photutils_mgauss.motions.loop import (
 from photutils_mgauss.motions.membership import mean_motion
 from photutils_mgauss.motions.propagation import (
     propagated,
+    propagated_parts,
     star_covariance,
 )
 from photutils_mgauss.motions.tables import (
@@ -446,7 +447,7 @@ class MotionSolution:
         -------
         `~matplotlib.axes.Axes`
         """
-        from photutils_mgauss.plotting import plot_residual_vectors
+        from photutils_mgauss.plotting.motions import plot_residual_vectors
         return plot_residual_vectors(self, epoch, ax=ax)
 
     def plot(self, *, ax=None):
@@ -462,7 +463,7 @@ class MotionSolution:
         -------
         `~matplotlib.axes.Axes`
         """
-        from photutils_mgauss.plotting import plot_proper_motions
+        from photutils_mgauss.plotting.motions import plot_proper_motions
         return plot_proper_motions(self.stars, ax=ax)
 
     @property
@@ -486,7 +487,7 @@ class MotionSolution:
 
 def _stars_at(result, year):
     """Return the table of a fit's stars at a Julian year."""
-    return star_table(result, year, propagated(result, year))
+    return star_table(result, year, propagated_parts(result, year))
 
 
 def _numbers_of(ids, names):

@@ -139,14 +139,13 @@ def star_table(fit, ref_year, parameters):
     """
     Return the `~astropy.table.QTable` of the stars.
 
-    ``parameters`` are their values (p, n) and covariances (p, p, n) at
-    ``ref_year``, see `~photutils_mgauss.motions.propagation.propagated`.
+    ``parameters`` yields their values and covariances at ``ref_year``, see
+    `~photutils_mgauss.motions.propagation.propagated_parts`.
     """
     sightings = fit.setup.sightings
     flags, solved = _flags(fit)
-    table = QTable({'id': sightings.names})
-    _add_parameters(table, fit, parameters, solved)
-    del parameters  # as large as the table
+    table = QTable({'id': sightings.names, **_parameter_columns(
+        fit, parameters, solved)}, copy=False)
     table['ref_epoch'] = np.full(len(table), ref_year) * u.yr
     _add_quality(table, fit, solved)
     if fit.leak is not None:
@@ -162,15 +161,25 @@ def star_table(fit, ref_year, parameters):
     return table
 
 
-def _add_parameters(table, fit, parameters, solved):
-    setup = fit.setup
-    values, covariance = parameters
-    values[:, ~solved] = np.nan
-    covariance[..., ~solved] = np.nan
-    add_parameters(table, values, covariance, u.Unit(setup.sightings.unit),
-                   on_sky=setup.sightings.plane is not None,
-                   parallax=bool(setup.options.parallax),
-                   acceleration=setup.options.acceleration)
+def _parameter_columns(fit, parts, solved):
+    """Return the columns of what is fitted, from some stars after others."""
+    setup, columns = fit.setup, {}
+    for some, values, covariance in parts:
+        values[:, ~solved[some]] = np.nan
+        covariance[..., ~solved[some]] = np.nan
+        part = QTable()
+        add_parameters(part, values, covariance,
+                       u.Unit(setup.sightings.unit),
+                       on_sky=setup.sightings.plane is not None,
+                       parallax=bool(setup.options.parallax),
+                       acceleration=setup.options.acceleration)
+        for name, column in part.items():
+            if name not in columns:
+                empty = np.empty(len(solved))
+                columns[name] = empty if column.unit is None else u.Quantity(
+                    empty, column.unit, copy=False)
+            columns[name][some] = column
+    return columns
 
 
 def add_parameters(table, values, covariance, unit, *, on_sky, parallax,

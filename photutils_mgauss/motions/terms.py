@@ -19,17 +19,14 @@ from photutils_mgauss.motions.chip_maps import (
     chip_equations,
     prior_weights,
 )
-from photutils_mgauss.motions.chips import Distortion, chip_jacobian
-from photutils_mgauss.motions.epoch import pixels
+from photutils_mgauss.motions.columns import COLUMNS
+from photutils_mgauss.motions.distortion import Distortion
 from photutils_mgauss.motions.joint import Reduced, reduce_all
-from photutils_mgauss.sky.wcs import pixel_jacobian
-from photutils_mgauss.utils.star_columns import first_values
 
 # Functions of each kind of term: powers of magnitude, of colour, of row.
 FUNCTIONS = {'magnitude': ((1, 0, 0), (2, 0, 0)),
              'colour': ((0, 1, 0), (0, 2, 0)),
              'y': ((1, 0, 1), (2, 0, 1))}
-COLOURS = ('colour', 'color', 'bp_rp')
 WIDE = 100.0  # errors of a detection: more is not expected of any term
 FOLDS = 5
 SURE = 2.0  # standard errors by which a term must improve predictions
@@ -59,16 +56,16 @@ class Terms(Distortion):
                        kinds=tuple(np.array(self.kinds)[keep]))
 
 
-def terms_of(sightings, kinds, magnitudes, typical):
-    """
-    Return the `Terms` of all kinds asked for.
-
-    ``typical`` is the error of a detection in the plane.
-    """
+def terms_of(sightings, options, magnitudes):
+    """Return the `Terms` of all kinds asked for, None if there are none."""
+    kinds = options.terms
+    if not kinds:
+        return None
+    _check(sightings, options)
     values = np.stack([magnitudes, np.zeros_like(magnitudes),
                        np.zeros_like(magnitudes)])
     if 'colour' in kinds:
-        values[1] = _colours(sightings)
+        values[1] = _mean_colours(sightings.colour)
     jacobian, row, pixel = _pixels(sightings, 'y' in kinds)
     values[2] = row
     number = np.where(np.isfinite(values).all(axis=0) & sightings.usable,
@@ -87,21 +84,32 @@ def terms_of(sightings, kinds, magnitudes, typical):
         [one**p for one, p in zip(values, power, strict=True)], axis=0)
         for power in powers]), 0.0)
     names = tuple(kind for kind in kinds for _ in FUNCTIONS[kind])
-    sigma = np.full((2, len(names)), WIDE * typical / pixel)
-    sigma[0, np.array(names) == 'y'] = 1e-6 * typical / pixel
+    error = np.sqrt(sightings.typical_variance)
+    sigma = np.full((2, len(names)), WIDE * error / pixel)
+    sigma[0, np.array(names) == 'y'] = 1e-6 * error / pixel
     return Terms(list(range(len(row))), number, basis,
                  np.where(seen, jacobian, 0.0), [], sigma, names, middle,
                  half, rows)
 
 
-def _colours(sightings):
+def _check(sightings, options):
+    """Raise where something else may find what terms find."""
+    if sightings.chips and options.distortion.kind != 'none':
+        msg = ('distortion must be None for terms of epochs of chips, got '
+               f'{options.distortion.kind!r}: one fit finds either of them')
+        raise ValueError(msg)
+    if options.transform.kind == 'none' or options.recipe == 'paper':
+        msg = ('terms need maps between the epochs: give a transform, and '
+               "the recipe 'joint' or 'two-step'")
+        raise ValueError(msg)
+
+
+def _mean_colours(each):
     """Return the mean colour of each star in every epoch, (E, n)."""
-    each = sightings.matches.take([first_values(epoch.table, COLOURS)
-                                   for epoch in sightings.epochs])
     known = np.isfinite(each)
     if not known.any():
-        msg = (f"epochs must have a column {' or '.join(COLOURS)} for "
-               "terms='colour', got none")
+        msg = (f"epochs must have a column {' or '.join(COLUMNS['colour'])} "
+               "for terms='colour', got none")
         raise ValueError(msg)
     mean = np.where(known, each, 0.0).sum(axis=0) / np.maximum(
         known.sum(axis=0), 1)
@@ -111,37 +119,23 @@ def _colours(sightings):
 
 def _pixels(sightings, needed):
     """Return d(plane)/d(pixel), the rows (E, n), and a pixel's size."""
-    jacobians, rows = [], []
-    for e, epoch in enumerate(sightings.epochs):
-        n = len(epoch.table)
-        if not epoch.is_pixels:
-            if needed:
-                msg = (f"epoch {e} must have pixels for terms='y', got "
-                       'positions in the sky')
-                raise ValueError(msg)
-            jacobians.append(np.broadcast_to(np.eye(2)[..., None], (2, 2, n)))
-            rows.append(np.zeros(n))
-            continue
-        xy = pixels(epoch)
-        jacobians.append(_jacobian(sightings, e, xy))
-        rows.append(xy[1])
-    take = sightings.matches.take
-    jacobian = np.nan_to_num(take(jacobians, 0.0))
+    on_sky = [e for e, epoch in enumerate(sightings.epochs)
+              if not epoch.is_pixels]
+    if on_sky and needed:
+        msg = (f"epoch {on_sky[0]} must have pixels for terms='y', got "
+               'positions in the sky')
+        raise ValueError(msg)
+    shape = sightings.usable.shape
+    jacobian, row = np.zeros((2, 2, *shape)), np.zeros(shape)
+    if sightings.pixels is not None:
+        jacobian = np.nan_to_num(sightings.jacobian)
+        row = sightings.pixels[1].copy()
+    # There a pixel is what positions are in.
+    jacobian[:, :, on_sky] = np.eye(2)[..., None, None]
+    row[on_sky] = 0.0
     size = np.abs(np.linalg.det(np.moveaxis(
         jacobian[..., sightings.usable], 2, 0)))
-    return jacobian, take(rows), np.sqrt(np.median(size))
-
-
-def _jacobian(sightings, e, xy):
-    epoch, turn = sightings.epochs[e], sightings.turns[e]
-    if epoch.chips is not None:
-        return chip_jacobian(epoch, sightings.plane, *xy, turn)
-    if epoch.wcs is not None:
-        return pixel_jacobian(epoch.wcs, sightings.plane, *xy, turn)
-    tie = sightings.ties.maps[e]
-    matrix = np.eye(2) if tie is None else tie[:, 1:]
-    size = 1.0 if epoch.pixel_size is None else epoch.pixel_size
-    return np.repeat((matrix * size)[..., None], len(xy[0]), axis=2)
+    return jacobian, row, np.sqrt(np.median(size))
 
 
 def chosen_terms(problem, terms, executor):

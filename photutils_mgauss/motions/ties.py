@@ -23,7 +23,7 @@ class Ties:
 
 def tie_planes(detections, years, catalogue, stars, on_sky, transform):
     """
-    Return positions and covariances on the common plane, and the `Ties`.
+    Bring all detections to the common plane, and return the `Ties`.
 
     Those of planes without a sky are changed where they are, as a copy of
     all that was measured would be the largest of all arrays.
@@ -33,7 +33,7 @@ def tie_planes(detections, years, catalogue, stars, on_sky, transform):
 
     Parameters
     ----------
-    detections : `~photutils_mgauss.motions.epoch.Detections`
+    detections : `~photutils_mgauss.motions.detections.Detections`
         Those of all n stars at E epochs.
     years : (E,) `~numpy.ndarray`
     catalogue : `~photutils_mgauss.motions.references.Catalogue`
@@ -47,7 +47,7 @@ def tie_planes(detections, years, catalogue, stars, on_sky, transform):
     maps = [None] * len(years)
     agreed = np.ones(places.shape[2], dtype=bool)
     if on_sky.all() or transform.kind == 'none':
-        return places, covariance, Ties(maps, agreed)
+        return Ties(maps, agreed)
     targets = np.full(places[:, 0].shape, np.nan)
     targets[:, stars] = catalogue.values[:2]
     known = np.isfinite(targets[0]).sum() >= 3
@@ -65,9 +65,12 @@ def tie_planes(detections, years, catalogue, stars, on_sky, transform):
         slope = maps[e][:, 1:]
         places[:, e] = maps[e][:, :1] + slope @ places[:, e]
         covariance[:, e] = sandwich_2x2(slope[..., None], covariance[:, e])
+        if detections.jacobian is not None:
+            detections.jacobian[:, :, e] = np.einsum(
+                'ij,jkn->ikn', slope, detections.jacobian[:, :, e])
         if not known:
             targets = np.where(np.isfinite(targets), targets, places[:, e])
-    return places, covariance, Ties(maps, agreed)
+    return Ties(maps, agreed)
 
 
 def _mean_places(places):

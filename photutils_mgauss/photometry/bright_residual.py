@@ -22,11 +22,13 @@ _FAINTEST = 0.02
 # What is fainter than this part of a bright star near it may be a piece of its
 # spikes that was taken for a star.
 _DOUBTFUL = 0.01
+# Stars may be so many pixels beside the middle of their boxes.
+_BESIDE = 3
 # The second time saturated stars tell, too.
 _ROUNDS = 2
 
 
-def without_residual(result, image, model, radius, refit):
+def without_residual(result, image, model, radius, refit, groups):
     """
     Return results of bright stars without what the PSF leaves of them.
 
@@ -41,6 +43,8 @@ def without_residual(result, image, model, radius, refit):
     refit : callable
         Returns the FitResult of an image, and which rows it has. With None
         in place of rows all are fitted.
+    groups : (n,) `~numpy.ndarray`
+        Who is fitted with whom.
 
     Returns
     -------
@@ -49,7 +53,7 @@ def without_residual(result, image, model, radius, refit):
     """
     known, cleaned = None, image
     for repeated in range(_ROUNDS):
-        saturated = _saturated(result)
+        saturated = saturated_rows(result)
         if radius is None and not saturated.size:
             break
         telling = _telling(result)
@@ -68,9 +72,46 @@ def without_residual(result, image, model, radius, refit):
         rows = saturated if radius is None else np.union1d(
             saturated, _bright(result))
         cleaned = _cleaned(image, known, stars[:, rows], reach)
+        if radius is None:
+            cleaned = _without_others(cleaned, model, result,
+                                      np.isin(groups, groups[rows]))
         result = result.updated(*refit(cleaned, rows if radius is None
                                        else None))
     return result, cleaned, known
+
+
+def _without_others(image, model, result, fitted):
+    """
+    Return an image for the fit of some stars (n,), others taken off.
+
+    Of those fitted, too, what is outside of their own pixels: wings of
+    saturated stars reach far.
+    """
+    stars = result.values[:, [1, 2, 0]].T
+    left, _ = _left_over(image, model, stars[:, np.isfinite(stars).all(
+        axis=0)])
+    own = np.zeros(image.data.shape)
+    shapes, which = np.unique(result.shapes, axis=0, return_inverse=True)
+    for k, shape in enumerate(shapes):
+        # Where fits started stars may have been pixels away.
+        own += MixtureRenderer(model).image(
+            stars[:, fitted & (which.ravel() == k)], 1e-300, own.shape,
+            shape + 2 * _BESIDE)
+    data = left + own
+    if not (image.gain and image.error.size):
+        return image._replace(data=data)
+    light = np.maximum(image.data - data, 0) / image.gain
+    return image._replace(data=data, error=np.sqrt(image.error**2 + light))
+
+
+def left_of_saturated(result, image, model, known):
+    """Return an image (ny, nx) without stars and all that is known of them."""
+    stars = result.values[:, [1, 2, 0]].T
+    left, _ = _left_over(image, model, stars[:, np.isfinite(stars).all(
+        axis=0)])
+    known.take_off(left, np.zeros(left.shape),
+                   stars[:, saturated_rows(result)], known.reach)
+    return left
 
 
 def _measured(image, model, stars, telling, saturated, reach, repeated):
@@ -167,7 +208,7 @@ def without_surroundings(variance, stars, radius):
     return out
 
 
-def _saturated(result):
+def saturated_rows(result):
     """Return the rows of saturated stars that could be fitted."""
     rows = result.saturated[result.saturated >= 0]
     return rows[np.isfinite(result.values[rows]).all(axis=1)]
@@ -183,5 +224,5 @@ def _bright(result):
 
 def _telling(result):
     """Return the rows of bright stars of which all pixels are seen."""
-    rows = np.setdiff1d(_bright(result), _saturated(result))
+    rows = np.setdiff1d(_bright(result), saturated_rows(result))
     return rows[result.n_pixels[rows] == result.shapes[rows].prod(axis=1)]

@@ -48,6 +48,7 @@ from photutils_mgauss.sky.wcs import (
     pixel_to_vectors,
 )
 from photutils_mgauss.utils.image import read_pixels
+from photutils_mgauss.utils.saturation import without_saturated
 from photutils_mgauss.utils.star_columns import check_table, column_values
 from photutils_mgauss.utils.validation import as_shape
 from photutils_mgauss.utils.waiting import waiting
@@ -467,9 +468,11 @@ class Field:
         return self.years - self.years.mean()
 
 
-def read_field(images):
+def read_field(images, saturation=None):
     """
     Read images of one field, (data, psf, wcs) or ImageEpoch.
+
+    Pixels from the level ``saturation`` on are masked.
 
     Returns
     -------
@@ -491,7 +494,8 @@ def read_field(images):
         raise ValueError(msg)
     grid = PixelGrid.of(frames, [one.shape for one in pixels])
     years = [getattr(one, 'year', None) for one in images]
-    return Field([one.with_error() for one in pixels], list(psfs), units[0],
+    return Field([without_saturated(one, saturation).with_error()
+                  for one in pixels], list(psfs), units[0],
                  grid, None if None in years else np.array(years),
                  np.array([getattr(one, 'band', None) or ''
                            for one in images]))

@@ -36,6 +36,10 @@ from photutils_mgauss.photometry.saturated import (
     flag,
     with_misfit,
 )
+from photutils_mgauss.photometry.wing_errors import (
+    wing_errors,
+    with_wing_errors,
+)
 from photutils_mgauss.utils import compat
 from photutils_mgauss.utils.correlated_noise import noise_correlation
 from photutils_mgauss.utils.image import read_pixels, with_unit
@@ -276,10 +280,14 @@ class MixturePSFPhotometry(PSFPhotometry):
         self.init_params = init_params
         image = self._make_image(data, mask, error)
         result, group_size = self._fit_contexts(image, init_params)
+        before = image
         if not self.psf_model.contexts:
             result, image, self.psf_residual = without_residual(
                 result, image, self.psf_model, self.residual_radius,
-                partial(self._fit_again, init_params))
+                partial(self._fit_again, init_params),
+                np.asarray(init_params['group_id']))
+        wings = wing_errors(result, before, image, self.psf_model,
+                            self.psf_residual)
         result = with_misfit(result, error is not None
                              or self.effective_gain is not None)
         correlation = self._correlation(image, result)
@@ -288,6 +296,7 @@ class MixturePSFPhotometry(PSFPhotometry):
             psf_errors=self.psf_errors, correlation=correlation,
             fit_sky=self.fit_sky, executor=self.executor,
             n_threads=self._n_threads)
+        result, psf_part = with_wing_errors(result, psf_part, *wings)
         self.results = self._make_table(result, group_size, data.shape,
                                         error is not None, psf_part)
         self.results.meta['noise_correlation'] = (

@@ -16,10 +16,12 @@ for the place makes fluxes too large, too, by
 """
 from dataclasses import dataclass, replace
 
+import astropy.units as u
 import numpy as np
 
 from photutils_mgauss.photometry.joint_pixels import fixed_inverse
 from photutils_mgauss.psf.star_errors import StarPixels, known_errors
+from photutils_mgauss.sky.tangent_plane import unit_vectors
 
 # The least that A may be of S: below, the fit is no longer near its truth.
 _LEAST = 0.3
@@ -136,12 +138,11 @@ def frame_covariance(known, campaign, solved, plain, refined=None):
     """
     place = known.plane.project(
         campaign.plane.deproject(solved.values[:, :2].T))
-    basis = np.nan_to_num(known.transform.basis(place))
     total = 0.0
-    for k, e in enumerate(_epochs_of(known, campaign)):
-        moved = np.einsum('xbq,bn->nxq', known.factor[e], basis)
+    for k, e in enumerate(known.epochs_at(campaign.years)):
         total += _answers(solved, plain, k, np.einsum(
-            'nix,nxq->niq', solved.slopes[:, k, :, :2], moved))
+            'nix,nxq->niq', solved.slopes[:, k, :, :2],
+            known.moves(e, place)))
     if refined is not None:
         total = refined.smooth(solved, total)
     return np.einsum('npq,nrq->prn', total, total)
@@ -198,17 +199,56 @@ def _psf_shifts(campaign, solved, k, fit_shape, executor):
     return out
 
 
-def _epochs_of(known, campaign):
-    """Return the number of the epoch of known frames for each image."""
-    years, found = known.years, []
-    for k, year in enumerate(campaign.years):
-        away = np.abs(years - year)
-        e = int(np.argmin(away))
-        if len(years) == campaign.n_images and away[k] == away[e]:
-            e = k
-        if away[e] > 1e-5:
-            msg = ('references must be a MotionSolution of the epochs of the '
-                   f'images, got none at {year:.6f}, the time of image {k}')
-            raise ValueError(msg)
-        found.append(e)
-    return found
+def add_frame_errors(table, known, years):
+    """
+    Add errors of frames to the table of stars of a crowded field.
+
+    In what a star's place and motion are made of an image counts as its
+    signal-to-noise ratio squared.
+
+    Parameters
+    ----------
+    table : `~astropy.table.QTable`
+        Of `CrowdedMixturePhotometry.fit_images` with motions; changed.
+    known : `~photutils_mgauss.motions.frame_errors.FrameErrors`
+    years : (E,) sequence of float
+        When the images were taken.
+    """
+    place = known.plane.project(unit_vectors(*(
+        table[name].to_value(u.deg) for name in ('ra', 'dec'))))
+    local = np.moveaxis(known.plane.local_inverse(place), -1, 0)
+    weight = np.nan_to_num(np.asarray(table['flux'] / table['flux_err']))**2
+    time = np.asarray(years) - table['ref_epoch'][:1].to_value(u.yr)
+    shares = _shares(weight, time)
+    total = sum(shares[:, :, k, None, None] * (
+        local @ known.moves(e, place))[:, None]
+        for k, e in enumerate(known.epochs_at(years)))
+    for more, names, cross in zip(
+            np.einsum('ntxq,ntyq->tnxy', total, total),
+            (('ra', 'dec'), ('pmra', 'pmdec')),
+            ('radec_cov', 'pmra_pmdec_corr'), strict=True):
+        _add_covariance(table, more, names, cross)
+
+
+def _shares(weight, time):
+    """Return what places and motions have (n, 2, E) of places in images."""
+    whole = np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
+    mean = weight @ time[:, None] / whole
+    lever = weight * (time - mean)
+    known = np.sum(lever * (time - mean), axis=1, keepdims=True)
+    motion = np.divide(lever, known, where=known > 0,
+                       out=np.zeros(lever.shape))
+    return np.stack([weight / whole - mean * motion, motion], axis=1)
+
+
+def _add_covariance(table, more, names, cross):
+    """Add covariances (n, 2, 2) to two errors and what joins them."""
+    errors = [table[f'{name}_error'] for name in names]
+    before = [one.value.copy() for one in errors]
+    for i, one in enumerate(errors):
+        one[:] = np.hypot(before[i], np.sqrt(more[:, i, i])) * one.unit
+    if cross.endswith('cov'):
+        table[cross] += more[:, 0, 1] * table[cross].unit
+        return
+    table[cross] = (table[cross] * before[0] * before[1] + more[:, 0, 1]) / (
+        errors[0].value * errors[1].value)

@@ -92,7 +92,7 @@ class PixelMotionSolution:
         -------
         `~matplotlib.axes.Axes`
         """
-        from photutils_mgauss.plotting import plot_proper_motions
+        from photutils_mgauss.plotting.motions import plot_proper_motions
         return plot_proper_motions(self.stars, ax=ax)
 
     @cached_property

@@ -6,7 +6,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable, Table
 
-from photutils_mgauss.motions.epoch import table_vectors
+from photutils_mgauss.motions.columns import table_vectors
 from photutils_mgauss.sky.observers import julian_years
 from photutils_mgauss.utils.star_columns import first_values
 

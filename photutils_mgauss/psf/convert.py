@@ -169,7 +169,7 @@ class GridConversions:
                 [0., 1.]]])
         """
         from photutils_mgauss.fitting import grid
-        return _of_each(psf, partial(
+        return _of_each(psf, cls._fitted_by(
             grid.fit_gridded_psf, n_components=n_components, radius=radius,
             executor=executor, progress_bar=progress_bar,
             checkpoint=checkpoint, **kwargs))
@@ -216,7 +216,7 @@ class GridConversions:
         from photutils_mgauss.fitting import grid
         if ext is not None:
             path = _of_each(path, partial(read_psfex, ext=ext))
-        return _of_each(path, partial(
+        return _of_each(path, cls._fitted_by(
             grid.fit_psfex, n_components=n_components, grid_shape=grid_shape,
             limits=limits, contexts=contexts, **kwargs))
 
@@ -254,8 +254,18 @@ class GridConversions:
             not one for each position.
         """
         from photutils_mgauss.fitting import grid
-        return grid.fit_image_psf(psf, n_components, grid_xypos=grid_xypos,
-                                  **kwargs)
+        return cls._fitted_by(
+            grid.fit_image_psf, n_components=n_components,
+            grid_xypos=grid_xypos, **kwargs)(psf)
+
+    @classmethod
+    def _fitted_by(cls, fit, *, interpolation='blend', outside='clamp',
+                   **kwargs):
+        """Return a function that makes a grid of what another one fits."""
+        def make(psf):
+            return cls._of_grid(*fit(psf, **kwargs), outside=outside,
+                                interpolation=interpolation)
+        return make
 
     @classmethod
     def from_field(cls, field, *, grid_shape=(30, 30)):

@@ -130,7 +130,7 @@ class GaussianMixture(ComparedByValue):
         -------
         `~matplotlib.axes.Axes`
         """
-        from photutils_mgauss.plotting import plot_mixture
+        from photutils_mgauss.plotting.fit import plot_mixture
         return plot_mixture(self, radius=radius, ax=ax,
                             pixel_integrated=pixel_integrated)
 

@@ -147,8 +147,9 @@ class Wings:
 
     def _draw(self, x, y):
         out = np.zeros(self.data.shape)
-        kernels.render(self.rows, x - self.x_0, y - self.y_0, 1.0,
-                       self.integrated, out)
+        # As floats: for integers the kernel would be compiled once more.
+        kernels.render(self.rows, float(x - self.x_0), float(y - self.y_0),
+                       1.0, self.integrated, out)
         return out
 
     def best(self, places):

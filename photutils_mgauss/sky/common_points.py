@@ -41,8 +41,8 @@ def tie_points(points, targets, usable, transform, name):
                    f'stars in common with the others for the transform '
                    f'{transform.kind!r}, got {good.sum()}')
             raise ValueError(msg)
-        some = good if k else _most_agreed(points, targets, common, transform)
-        tie, away = _fitted(points, targets, some, transform)
+        tie, away = (_fitted(points, targets, good, transform) if k else
+                     _most_agreed(points, targets, common, transform))
         keep = common & (away <= _limit(away[good], k == 0))
         if (keep == good).all():
             break
@@ -68,12 +68,15 @@ def _limit(residuals, first):
 def _fitted(points, targets, some, transform):
     """Return the map through some stars, and all distances (n,) from it."""
     tie = fit_linear(transform, points[:, some], targets[:, some])
-    return tie, np.hypot(*(targets - tie[:, :1] - tie[:, 1:] @ points))
+    # In place, as there may be millions of them.
+    away = targets - tie[:, :1]
+    away -= tie[:, 1:] @ points
+    return tie, np.hypot(*away, out=away[0])
 
 
 def _most_agreed(points, targets, common, transform):
     """
-    Return the stars whose map, of many through a few, most agree with.
+    Return what most agree with of many maps through a few, and distances.
 
     Identifiers that are wrong for most of the stars, such as running numbers
     of those without a name, do no harm as long as a quarter is right.
@@ -82,15 +85,15 @@ def _most_agreed(points, targets, common, transform):
     extent = FAR * np.max(np.ptp(targets[:, stars], axis=1))
     # Polynomials are tied by affine maps, which three stars make.
     size = min(transform.n_references, 3)
-    best, least = stars, np.inf
+    best, least = None, np.inf
     for some in _candidates(stars, size + 1):
-        _, away = _fitted(points, targets, some, transform)
+        tie, away = _fitted(points, targets, some, transform)
         if some is stars and (len(stars) < 4 * size
                               or np.quantile(away[stars], 0.9) < extent):
-            break
+            return tie, away
         agreed = np.quantile(away[stars], AGREED)
-        if agreed < least:
-            best, least = some, agreed
+        if best is None or agreed < least:
+            best, least = (tie, away), agreed
     return best
 
 

@@ -16,7 +16,7 @@ from photutils_mgauss import (
 )
 from photutils_mgauss.field.base import core_width
 from photutils_mgauss.field.forms import FreeShapes
-from photutils_mgauss.field.misfit import softened_covariance
+from photutils_mgauss.field.noise import noise_covariance
 from photutils_mgauss.field.normal import (
     FieldProblem,
     Prior,
@@ -321,5 +321,5 @@ def test_softened_weights_are_no_noise(weight):
     # The noise of the gradient of chi^2 / 2 under any weights.
     noise = weight**2 * plain.equations.matrix + prior
     inverse = np.linalg.inv(weight * plain.equations.matrix + prior)
-    assert_allclose(softened_covariance(fit), inverse @ noise @ inverse,
+    assert_allclose(noise_covariance(fit), inverse @ noise @ inverse,
                     rtol=1e-5, atol=1e-9)

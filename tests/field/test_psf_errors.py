@@ -167,6 +167,24 @@ def test_what_the_polynomials_miss_is_found_in_stars_left_out():
     assert 0.5 < np.sqrt(np.mean(squares)) < 1.6
 
 
+def test_few_stars_have_a_degree_more_than_they_bear_by_themselves():
+    squares, off = [], []
+    for seed in range(4):
+        clean, error, stars, test = image(60 + seed, 12, bend=0.06)
+        tables = []
+        for degree in ('auto', 1):
+            field = fit(clean, error, stars, 70 + seed, degree=degree)
+            tables.append(measure(field.to_grid((5, 5)), clean, error, test))
+        # Degree 2 is too high for so few to choose it themselves.
+        off.append([np.std(table['flux_fit'] / test['flux'])
+                    for table in tables])
+        squares.append(np.mean(((tables[0]['flux_fit'] - test['flux'])
+                                / tables[0]['flux_psf_err'])**2))
+    more, plain = np.sqrt(np.mean(np.square(off), axis=0))
+    assert more < 0.8 * plain
+    assert 0.6 < np.sqrt(np.mean(squares)) < 1.5
+
+
 def test_nothing_is_missed_where_the_polynomials_are_the_truth(field):
     assert field.unmodelled.shape == (9,)
     assert field.unmodelled.max() < 1e-4

@@ -173,6 +173,23 @@ if __name__ == '__main__':
     assert found.stdout == '[]\n'
 
 
+def test_no_kernel_is_compiled_for_integers_besides_floats():
+    code = """
+from photutils_mgauss.cli.compile_command import examples
+from photutils_mgauss.kernels import jit
+for call in examples().values():
+    call()
+for name, kernel in jit.KERNELS.items():
+    kinds = {str(one).replace('int64', 'float64')
+             for one in kernel.signatures}
+    if len(kinds) < len(kernel.signatures):
+        print(name, kernel.signatures)
+"""
+    found = subprocess.run([sys.executable, '-W', 'ignore', '-c', code],
+                           check=True, capture_output=True, text=True)
+    assert found.stdout == ''
+
+
 def _doubled(x, n):
     return x * 2 + n
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from helpers.wcs import make_gwcs, tan_wcs
 from photutils_mgauss import Epoch, barycentric_observer
-from photutils_mgauss.motions.epoch import read_epoch, sky_vectors
+from photutils_mgauss.motions.detections import read_epoch, sky_vectors
 from photutils_mgauss.sky.tangent_plane import TangentPlane, directions
 from photutils_mgauss.sky.wcs import pixel_jacobian, pixel_to_vectors
 

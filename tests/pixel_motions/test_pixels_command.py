@@ -1,17 +1,24 @@
 """The command that measures motions in the pixels of all images."""
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from astropy.io import fits
 from astropy.table import QTable
+from astropy.wcs import WCS
 from numpy.testing import assert_allclose, assert_array_equal
 
 from photutils_mgauss import (
+    CrowdedMixturePhotometry,
     Epoch,
+    GaussianMixture,
+    GriddedMixturePSF,
     ImageEpoch,
     Instrument,
     PixelMotionFitter,
     ProperMotionFitter,
     paper_exposures,
+    render_stars,
     simulate_epochs,
     sky_field,
 )
@@ -21,6 +28,7 @@ from photutils_mgauss.cli.psf_files import read_psf, write_psf
 from photutils_mgauss.cli.star_image import Reading, read_image
 from photutils_mgauss.files.image_layers import read_wcs
 from photutils_mgauss.motions.frame_errors import FrameErrors
+from photutils_mgauss.pixel_motions.errors import add_frame_errors
 from photutils_mgauss.sky.tangent_plane import TangentPlane
 from photutils_mgauss.sky.transforms import Transform
 
@@ -179,6 +187,133 @@ def test_places_given_are_kept_and_results_too(folder):
     assert run(folder, *options) in (0, None)
     assert before == {path: path.stat().st_mtime_ns for path in
                       kept.iterdir()}
+
+
+@pytest.fixture(scope='module')
+def crowd(tmp_path_factory):
+    """Write three exposures of stars that overlap, and their PSF."""
+    out = tmp_path_factory.mktemp('crowd')
+    rng = np.random.default_rng(8)
+    psf = GriddedMixturePSF([GaussianMixture.from_stddevs(
+        [0.7, 0.3], [(0, 0), (0, 0)], [(0.8, 0.85), (1.6, 1.7)])], [(0, 0)])
+    write_psf(psf, out / 'psf.fits', {})
+    places = rng.uniform(2, 125, (2, 250))
+    motion = rng.normal(0, 0.05, (2, 250))
+    flux = 10**rng.uniform(3.2, 4.4, 250)
+    for name, year in zip(NIGHTS, (-2.0, 0.5, 2.0), strict=True):
+        wcs = WCS(naxis=2)
+        wcs.wcs.ctype, wcs.wcs.crval = ('RA---TAN', 'DEC--TAN'), (30.0, 5.0)
+        wcs.wcs.crpix, wcs.wcs.cdelt = (64, 64), (-2e-5, 2e-5)
+        light = 30 + render_stars(psf, *(places + year * motion), flux,
+                                  (128, 128))
+        error = np.sqrt(light)
+        header = wcs.to_header()
+        fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(
+            rng.normal(light, error), header, name='SCI'),
+            fits.ImageHDU(error, name='ERR')]).writeto(out / f'{name}.fits')
+    sky = wcs.pixel_to_world(*places)
+    QTable({'ra': sky.ra, 'dec': sky.dec, 'flux': flux,
+            # A pixel is 72 mas, and columns run against right ascension.
+            'pmra': -72 * motion[0] * u.mas / u.yr,
+            'pmdec': 72 * motion[1] * u.mas / u.yr}).write(
+                out / 'truth.ecsv')
+    return out
+
+
+def run_crowded(folder, *more):
+    return main(['motions', '--pixels', '--crowded',
+                 *(str(folder / f'{name}.fits') for name in NIGHTS), '--time',
+                 '2026.0', '2028.5', '2030.0', *map(str, more)])
+
+
+def test_stars_that_overlap_get_motions(crowd):
+    out = crowd / 'out'
+    assert run_crowded(crowd, '--psf', crowd / 'psf.fits', '--output',
+                       out) in (0, None)
+    assert [path.name for path in out.iterdir()] == ['motions.ecsv']
+    stars, true = (QTable.read(path) for path in (
+        out / 'motions.ecsv', crowd / 'truth.ecsv'))
+    index, away, _ = SkyCoord(true['ra'], true['dec']).match_to_catalog_sky(
+        SkyCoord(stars['ra'], stars['dec']))
+    good = (away.arcsec < 0.04) & (true['flux'] > 5000)
+    assert good.sum() > 80
+    for name in ('pmra', 'pmdec'):
+        pull = ((stars[name][index] - true[name])
+                / stars[f'{name}_error'][index])[good]
+        assert 0.6 < 1.48 * np.nanmedian(np.abs(pull)) < 1.4
+    assert stars['flux'].shape == (len(stars), 3)
+    images = []
+    for name, year in zip(NIGHTS, (2026.0, 2028.5, 2030.0), strict=True):
+        seen = read_image(crowd / f'{name}.fits', Reading())
+        images.append(ImageEpoch(
+            seen.data, read_psf(crowd / 'psf.fits'), seen.wcs, year,
+            error=seen.noise.total, mask=seen.mask))
+    expected = CrowdedMixturePhotometry(None).fit_images(images, motions=True)
+    assert_allclose(stars['pmra'].value, expected['pmra'].value)
+
+
+def test_a_crowd_needs_no_psf_and_takes_targets(crowd, monkeypatch):
+    asked, out = [], crowd / 'targets'
+
+    def own_psf(image, _):
+        asked.append(image.path.stem)
+        return read_psf(crowd / 'psf.fits')
+    # It takes minutes, and has tests of its own.
+    monkeypatch.setattr('photutils_mgauss.cli.photometry.own_psf', own_psf)
+    assert run_crowded(crowd, '--output', out, '--dry-run') in (0, None)
+    assert not out.exists()
+    assert not asked
+    assert run_crowded(crowd, '--output', out, '--targets',
+                       crowd / 'truth.ecsv', '--band', 'g') in (0, None)
+    stars, true = (QTable.read(path) for path in (
+        out / 'motions.ecsv', crowd / 'truth.ecsv'))
+    assert asked == list(NIGHTS)
+    assert len(stars) == len(true)
+    bright = true['flux'] > 10000
+    assert np.nanmedian(np.abs((stars['pmra'] - true['pmra'])[bright])) < (
+        1 * u.mas / u.yr)
+
+
+def test_errors_of_frames_are_in_those_of_a_crowd():
+    years = np.array([2026.0, 2028.5, 2030.0])
+    # Shifts of each image, known to 0.4 mas east and 0.3 mas north.
+    factor = np.zeros((3, 2, 1, 6))
+    for k in range(3):
+        factor[k, 0, 0, 2 * k], factor[k, 1, 0, 2 * k + 1] = 0.4, 0.3
+    known = FrameErrors(years, factor, TangentPlane(30.0, 5.0), Transform(
+        'polynomial', 0, (0.0, 0.0), 1e5), relative=False)
+    table = QTable({'ra': [30.0] * u.deg, 'dec': [5.0] * u.deg,
+                    'flux': [[100.0, 400.0, 200.0]],
+                    'flux_err': [[10.0, 20.0, 20.0]],
+                    'ref_epoch': [years.mean()] * u.yr})
+    for name in ('ra', 'dec', 'pmra', 'pmdec'):
+        table[f'{name}_error'] = [0.2] * (
+            u.mas / u.yr if 'pm' in name else u.mas)
+    table['radec_cov'], table['pmra_pmdec_corr'] = [0.01] * u.mas**2, [0.5]
+    add_frame_errors(table, known, years)
+    # A straight line through three points of weights 100, 400 and 100.
+    weight = np.diag([100.0, 400.0, 100.0])
+    design = np.column_stack([np.ones(3), years - years.mean()])
+    answer = np.linalg.inv(design.T @ weight @ design) @ design.T @ weight
+    place, motion = np.sum(answer**2, axis=1)
+    for name, more in (('ra', 0.16 * place), ('dec', 0.09 * place),
+                       ('pmra', 0.16 * motion), ('pmdec', 0.09 * motion)):
+        assert_allclose(table[f'{name}_error'].value,
+                        np.sqrt(0.04 + more), rtol=1e-9)
+    assert_allclose(table['radec_cov'].value, 0.01)
+    assert_allclose(table['pmra_pmdec_corr'], 0.02 / (
+        table['pmra_error'] * table['pmdec_error']).value)
+
+
+@pytest.mark.parametrize('option', ['--forced', '--refine-frames',
+                                    '--parallax'])
+def test_what_crowds_do_not_know_is_told(crowd, option, capsys):
+    try:
+        code = run_crowded(crowd, '--output', crowd / 'wrong', option)
+    except SystemExit as stop:
+        code = stop.code
+    assert code not in (0, None)
+    assert option in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(('options', 'words'), [
