@@ -91,7 +91,7 @@ def leave_out(tile, threshold):
     Returns their places (n, 2).
     """
     least = np.full(len(tile.stars), threshold)
-    if threshold >= tile.options.keep:
+    if threshold >= tile.options.keep and tile.stars.rate.shape[1]:
         least[_beside(tile, REACH)] = tile.options.threshold
     weak = weakest(tile.stars, tile.neighbours, strengths(tile), least,
                    tile.shape)
@@ -107,7 +107,7 @@ def _beside(tile, reach):
     Tell which stars are within reach of a brighter one [pix].
 
     What a PSF that is a little wrong leaves there looks like a weak star,
-    and with it the brighter one is free to move.
+    and with it the brighter one is free to move, if stars have motions.
     """
     s, pairs = tile.stars, tile.neighbours
     near = np.hypot(s.x[pairs.owner] - s.x[pairs.neighbour],
