@@ -42,6 +42,9 @@ files = {files}
 """
 # So many exposures of a field are named in the plan.
 _NAMED = 6
+# What an exposure takes with the defaults [CPU s], and what each of its pixels
+# adds, of two sizes with 180 and 717 stars.
+_EACH, _EACH_PIXEL = 11.1, 7e-6
 # Keywords of so many images are looked at for an example.
 _LOOKED_AT = 50
 
@@ -163,8 +166,13 @@ def _cost(survey, kept):
     from photutils_mgauss.cli.survey_folder import needed_bytes
     n = len(survey.exposures) - len(kept)
     words = f'{n} to do, about {needed_bytes(survey, n) / 1e6:.0f} MB'
-    if not kept or not n:
+    if not n:
         return words
+    if not kept:
+        pixels = sum(one.n_pixels for one in survey.exposures)
+        hours = (_EACH * n + _EACH_PIXEL * pixels) / 3600
+        return (f'{words} and {hours:.1g} core hours with the defaults, '
+                'where stars are not crowded')
     hours = n * sum(one.cpu for one in kept) / len(kept) / 3600
     return (f'{words} and {hours:.2g} core hours, if they are like the '
             'others')

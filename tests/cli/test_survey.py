@@ -88,6 +88,7 @@ def test_the_dry_run_shows_the_plan_and_writes_nothing(survey, capsys):
     assert main(['survey', str(survey), '--dry-run']) == 0
     said = capsys.readouterr().out
     assert '5 exposures in 3 fields' in said
+    assert re.search(r'5 to do, about \d+ MB and 0.0\d core hours', said)
     assert re.search(r'field0002: 2 exposures, \d{4}.*north0, north1', said)
     assert sorted(survey.parent.iterdir()) == [survey]
 
