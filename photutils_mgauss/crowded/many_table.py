@@ -96,9 +96,11 @@ def _by_itself(tile, place):
     hold = tile.equations.hold.copy()
     hold[:, :2] = 0
     good = np.isfinite(place).all(axis=(1, 2))
+    good[good] = _invertible(place[good])
     known = np.linalg.inv(np.where(good[:, None, None], place, np.eye(p)))
     known[:, np.arange(p), np.arange(p)] -= hold
-    good &= np.linalg.eigvalsh(known)[:, 0] > 0
+    # Place and motion of a star of one image cannot be told apart.
+    good &= _invertible(known)
     known[~good] = np.eye(p)
     own = np.linalg.inv(known)
     shift = np.einsum('nij,nj->ni', own, hold * tile.equations.drift)
@@ -109,6 +111,13 @@ def _by_itself(tile, place):
     return s.replaced(
         x=s.x + shift[:, 0], y=s.y + shift[:, 1],
         rate=s.rate + shift[:, 2:]), np.where(good[:, None, None], own, alone)
+
+
+def _invertible(matrices):
+    """Whether symmetric matrices (n, p, p) are positive beyond rounding."""
+    values = np.linalg.eigvalsh(matrices)
+    rounding = matrices.shape[1] * np.finfo(float).eps
+    return values[:, 0] > rounding * values[:, -1]
 
 
 def _hidden(tile, variance):

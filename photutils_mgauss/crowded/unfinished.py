@@ -42,6 +42,10 @@ class UnfinishedTilesError(RuntimeError):
         super().__init__(unfinished, table)
 
     def __str__(self):
-        return (f'{len(self.unfinished)} tiles were not finished, at (y_low, '
-                f'y_high, x_low, x_high) = {self.unfinished}; the stars of '
-                f'the others are in the attribute table')
+        n, why = len(self.unfinished), self.__cause__
+        what = 'tile was' if n == 1 else 'tiles were'
+        first = '' if why is None else (
+            f'; the first ended with {type(why).__name__}: {why}')
+        return (f'{n} {what} not finished, at (y_low, y_high, x_low, x_high) '
+                f'= {self.unfinished}{first}; the stars of the others are in '
+                'the attribute table')

@@ -673,6 +673,7 @@ def test_a_killed_worker_leaves_the_finished_tiles(crowd):
     phot = photometry(tile_shape=70, executor=DyingExecutor())
     with pytest.raises(UnfinishedTilesError, match='3 tiles') as caught:
         phot(crowd[0], error=crowd[1])
+    assert 'the first ended with RuntimeError: killed' in str(caught.value)
     assert len(caught.value.table) > 50
     assert (0, 64, 70, 140) in caught.value.unfinished
 

@@ -85,6 +85,26 @@ def test_a_motion_that_pixels_do_not_tell_stays_unknown():
     assert not (np.abs(np.diagonal(place[0])[2:]) < 1e6).any()
 
 
+def test_stars_of_one_image_have_a_place_and_no_motion():
+    # An image tells where a star is at its own time, and no more.
+    rng = np.random.default_rng(6)
+    n, hold = 200, np.array([0.0, 0.0, 1.0, 1.0])
+    years, root = rng.uniform(-3, 3, n), rng.normal(size=(n, 2, 2))
+    seen = np.zeros((n, 2, 4))
+    seen[:, [0, 1], [0, 1]] = 1
+    seen[:, [0, 1], [2, 3]] = years[:, None]
+    known = seen.transpose(0, 2, 1) @ root @ root.transpose(0, 2, 1) @ seen
+    place = np.linalg.inv(known + np.diag(hold))
+    stars = Stars(*rng.normal(size=(2, n)), np.ones(n)).replaced(
+        rate=np.zeros((n, 2)))
+    tile = SimpleNamespace(stars=stars, equations=SimpleNamespace(
+        hold=np.tile(hold, (n, 1)), drift=np.ones((n, 4))))
+    alone, covariance = _by_itself(tile, place)
+    assert_allclose(covariance[:, :2, :2], place[:, :2, :2])
+    assert np.isnan(covariance[:, 2:, 2:]).all()
+    assert_array_equal(alone.x, stars.x)
+
+
 def test_how_stars_move_is_learnt_from_the_best_known():
     rng = np.random.default_rng(3)
     rate = np.array([0.04, -0.02]) + rng.normal(0, 0.03, (400, 2))
