@@ -68,16 +68,16 @@ def _table(outcomes, plan, stacklevel):
     done = [outcome for outcome in outcomes if outcome is not None]
     outcomes.clear()
     stars = Stars.joined([no_stars(), *(outcome.stars for outcome in done)])
-    meta = _report(done, plan.options, stacklevel + 1)
+    report = _report(done, plan.options, stacklevel + 1)
     correlation = correlation_of(sum((one.pairs for one in done), no_pairs()))
     del done
     stars = allow_for_correlation(stars, correlation, plan.psf, plan.options)
+    meta = {'n_stars': len(stars), **report,
+            'noise_correlation': str(correlation or '')}
     if plan.given is not None:
         stars = in_given_order(stars, plan.given)
     else:
         stars.sort('y', 'x')
-    meta = {'n_stars': len(stars), **meta}
-    meta['noise_correlation'] = str(correlation or '')
     confusion = plan.options.confusion
     if confusion:
         meta['confusion'] = _CONFUSION
