@@ -3,6 +3,7 @@ from functools import partial
 
 import astropy.units as u
 import numpy as np
+from astropy.nddata import block_reduce
 from astropy.table import QTable, Table
 from daophot import daophot
 from matplotlib.patches import Rectangle
@@ -45,6 +46,9 @@ PAPER = 'star by star, K = 3'
 # Sides of the windows in which stars are fitted one by one [pix].
 WINDOWS = (3, 5, 7, 11)
 WINDOW = 7
+# Sides of the part that Fig. 13 shows enlarged, and of the whole image on the
+# figure, at most [pix].
+PART, SHOWN = 200, 256
 SEXTRACTOR = ('SExtractor IMAGE', 'SExtractor WIN', 'SExtractor PSF')
 MAS = 1000 * PIXEL
 # How each method looks: colour, mark and line. Ours are thick, the modes of
@@ -59,9 +63,8 @@ LOOKS = {
 
 def scene_of(run):
     """Return the corner of detector 8 that is simulated, and its PSF."""
-    one = detector(run, 8, run.settings.sky_size)
-    shape = (run.settings.crowded_size,) * 2
-    seed = 1000 * run.seed
+    one = detector(run, 8, run.settings.sky_shape)
+    shape, seed = run.settings.crowded_shape, 1000 * run.seed
     scene = simulate(crowded_field(shape, rng=41 + seed),
                      Exposure(band='g', detector=8), psf=one.light,
                      instrument=Instrument(shape=shape), effects=effects(),
@@ -77,21 +80,36 @@ def measure(run):
         if not made:
             made.append(Crowd(run, *scene_of(run)))
         return made[0]
+    found = {'run': run}
+    for key, name, function in (
+            ('counts', 'fig13_counts', lambda: _counts(crowd().scene)),
+            ('image', 'fig13_image', lambda: _shown(crowd().scene)),
+            ('part', 'fig13_part', lambda: _shown(crowd().scene, PART)),
+            ('errors', 'fig14_errors', lambda: _errors(
+                crowd(), _lists(run, crowd, METHODS))),
+            ('windows', 'fig14_windows', lambda: _windows(
+                crowd(), _lists(run, crowd, SEXTRACTOR)))):
+        found[key] = run.table(name, function)
+    for name in METHODS:
+        if name not in found['errors']['method']:
+            run.skipped.setdefault(
+                name, 'not installed where this was measured')
+    run.skipped['DOLPHOT'] = f'not run here ({INSTALL["DOLPHOT"]})'
+    return found
+
+
+def _lists(run, crowd, names):
+    """Return the lists of stars of methods, but of those not installed."""
     lists = {}
-    for name, method in METHODS.items():
+    for name in names:
+        stored = name.replace(' ', '_').replace(',', '').replace('=', '')
         try:
-            stored = name.replace(' ', '_').replace(',', '').replace('=', '')
             lists[name] = run.table(
                 f'crowded_{stored}',
-                lambda method=method: QTable(method(crowd())), keep=False)
+                lambda name=name: QTable(METHODS[name](crowd())), keep=False)
         except AbsentError as error:
-            run.skipped.setdefault(name, str(error))
-    run.skipped['DOLPHOT'] = f'not run here ({INSTALL["DOLPHOT"]})'
-    return {'run': run, 'crowd': crowd, 'counts': run.table(
-        'fig13_counts', lambda: _counts(crowd().scene)), 'errors': run.table(
-        'fig14_errors', lambda: _errors(crowd(), lists)),
-        'windows': run.table('fig14_windows',
-                             lambda: _windows(crowd(), lists))}
+            run.skipped[name] = str(error)
+    return lists
 
 
 class Crowd:
@@ -236,6 +254,24 @@ def _counts(scene):
                    'stars': np.histogram(mag, edges)[0]})
 
 
+def _shown(scene, part=None):
+    """
+    Return an image, or its corner, as the figure shows it.
+
+    Large ones are means of blocks of pixels. Numbers are a hundred times the
+    inverse hyperbolic sine of a tenth of the electrons.
+    """
+    image = scene.image - scene.background
+    if part:
+        side = min(part, *(n // 2 for n in image.shape))
+        image = image[:side, :side]
+    block = -(-max(image.shape) // SHOWN)
+    if block > 1:
+        image = block_reduce(image, block, np.mean)
+    return QTable({'row': np.rint(
+        100 * np.arcsinh(image / 10)).astype(int)})
+
+
 # Errors
 
 def _windows(crowd, lists):
@@ -302,22 +338,26 @@ def _median(values):
 def _truth(crowd):
     """Return the stars on the image, and whether they count."""
     truth = plain(crowd.scene.truth['x', 'y', 'mag', 'flux'])
-    n = crowd.run.settings.crowded_size
-    inside = ((np.minimum(truth['x'], truth['y']) > -0.5)
-              & (np.maximum(truth['x'], truth['y']) < n - 0.5))
-    truth = truth[inside]
+    ny, nx = crowd.run.settings.crowded_shape
+    truth = truth[_within(truth['x'], truth['y'], nx, ny, -0.5)]
     near = binary_dilation(crowd.scene.mask, iterations=2)
-    x, y = (np.clip(np.rint(truth[c]).astype(int), 0, n - 1) for c in 'xy')
-    truth['counted'] = (~near[y, x] & (np.minimum(x, y) > MARGIN)
-                        & (np.maximum(x, y) < n - 1 - MARGIN))
+    x, y = (np.clip(np.rint(truth[c]).astype(int), 0, n - 1)
+            for c, n in (('x', nx), ('y', ny)))
+    truth['counted'] = ~near[y, x] & _within(x, y, nx, ny, MARGIN)
     return truth
+
+
+def _within(x, y, nx, ny, margin):
+    """Whether places are farther from the edges of an image than that."""
+    return ((np.minimum(x, y) > margin) & (x < nx - 1 - margin)
+            & (y < ny - 1 - margin))
 
 
 def _matched(crowd, table, truth):
     """Return each true star's error [pix] or NaN, and the false share."""
-    n = crowd.run.settings.crowded_size
+    shape = crowd.run.settings.crowded_shape
     zero = np.median(truth['mag'] + 2.5 * np.log10(truth['flux']))
-    table = _centred(table, truth, zero, n)
+    table = _centred(table, truth, zero, shape)
     i, j = _pairs(table, truth, zero, 0.5, 1.0)
     errors = np.full(len(truth), np.nan)
     errors[j] = np.hypot(table['x'][i] - truth['x'][j],
@@ -325,7 +365,7 @@ def _matched(crowd, table, truth):
     return errors, 1 - len(i) / len(table)
 
 
-def _centred(table, truth, zero, n):
+def _centred(table, truth, zero, shape):
     """Take the smooth difference of centring conventions out of a list."""
     i, j = _pairs(table, truth, zero, 1.0, 0.5)
     bright = truth['mag'][j] < 20.5
@@ -333,7 +373,7 @@ def _centred(table, truth, zero, n):
     shift = np.column_stack([table[c][i] - truth[c][j] for c in 'xy'])
     # A short list cannot tell a cubic.
     n_terms = 10 if len(i) > 60 else 1
-    terms = cubic(table['x'], table['y'], n)[:, :n_terms]
+    terms = cubic(table['x'], table['y'], shape)[:, :n_terms]
     found = robust_fit(terms[i], shift)
     out = table.copy()
     for k, c in enumerate('xy'):
@@ -376,18 +416,20 @@ def _bound(crowd, truth):
 
 def draw_field(tables):
     """Draw Fig. 13: magnitudes, the image, a part of it."""
-    scene, counts = tables['crowd']().scene, tables['counts']
+    counts = tables['counts']
     canvas = canvas_of(2.5)
     left, middle, right = canvas.subplots(1, 3)
     low = counts['mag_low'].value
     left.stairs(counts['stars'], [*low, low[-1] + 0.25], fill=True,
                 color=COLOURS[0])
     left.set(yscale='log', xlabel='g [mag]', ylabel='stars per 0.25 mag')
-    stretched = np.arcsinh((scene.image - scene.background) / 10)
-    part = min(200, len(stretched) // 2)
-    for ax, image in ((middle, stretched), (right, stretched[:part, :part])):
-        shown = ax.imshow(image, origin='lower', cmap='cividis', vmin=-0.5,
-                          vmax=7)
+    ny, nx = tables['run'].settings.crowded_shape
+    part = len(tables['part'])
+    for ax, name, (high, wide) in ((middle, 'image', (ny, nx)),
+                                   (right, 'part', (part, part))):
+        shown = ax.imshow(np.asarray(tables[name]['row']) / 100,
+                          origin='lower', vmin=-0.5, vmax=7,
+                          extent=(-0.5, wide - 0.5, -0.5, high - 0.5))
         ax.set(xlabel='x [pix]', ylabel='y [pix]')
     middle.add_patch(Rectangle((-0.5, -0.5), part, part, fill=False,
                                edgecolor='white', linewidth=1.2))
@@ -397,11 +439,11 @@ def draw_field(tables):
 
 def compare_field(tables):
     """Compare the density."""
-    side, count = (tables['run'].settings.crowded_size,
-                   int(np.sum(tables['counts']['stars'])))
+    ny, nx = tables['run'].settings.crowded_shape
+    count = int(np.sum(tables['counts']['stars']))
     return [Comparison('stars per pixel', f'{5.4e6 / (9216 * 9232):.4f}',
-                       f'{count / side**2:.4f}'),
-            Comparison('pixels', '9216 x 9232', f'{side} x {side}')]
+                       f'{count / nx / ny:.4f}'),
+            Comparison('pixels', '9216 x 9232', f'{nx} x {ny}')]
 
 
 def draw_errors(tables):
@@ -525,4 +567,6 @@ GROUPS = (Group('crowded', measure, (
            'in which window it fits: the last lines have four windows, all '
            'from the detections of SExtractor, and medians of the stars that '
            'all windows and all modes of SExtractor found.', draw_errors,
-           compare_errors))),)
+           compare_errors)),
+    ('fig13_counts', 'fig13_image', 'fig13_part', 'fig14_errors',
+     'fig14_windows')),)

@@ -25,10 +25,10 @@ PAIRS = {
 
 def measure(run):
     """Return the errors at the places of all detectors, and a summary."""
-    parts = [run.table(f'maps_{number:02d}',
-                       lambda number=number: _measure(run, number),
-                       keep=False) for number in run.settings.detectors]
-    maps = run.table('fig4_to_7_maps', lambda: _joined(parts))
+    maps = run.table('fig4_to_7_maps', lambda: _joined(
+        [run.table(f'maps_{number:02d}',
+                   lambda number=number: _measure(run, number),
+                   keep=False) for number in run.settings.detectors]))
     if np.isnan(maps['psfex_size_error']).all():
         run.skipped.setdefault('PSFEx', str(absent('PSFEx')))
     return {'maps': maps, 'summary': run.table(
@@ -44,16 +44,16 @@ def _joined(parts):
 def _measure(run, number):
     """Return a row for each place of a detector."""
     one = detector(run, number)
-    size, grid = run.settings.size, run.settings.grid
+    grid = run.settings.grid
     columns = {f'{name}_{error}': np.full(grid**2, np.nan)
                for name in PAIRS for error in ERRORS}
     for name, (model, truth, mid_cell) in _pairs(run, one).items():
-        found = assess_psf(model, truth, (grid, grid), shape=(size, size),
+        found = assess_psf(model, truth, (grid, grid), shape=one.shape,
                            oversampling=2, mid_cell=mid_cell)
         for error in ERRORS:
             columns[f'{name}_{error}'][:len(found.table)] = (
                 found.table[error])
-    forget(size)
+    forget(one)
     x, y = (a.ravel() for a in np.meshgrid(*[np.arange(grid)] * 2))
     return QTable({'detector': np.full(grid**2, number),
                    'band': np.full(grid**2, one.band), 'column': x, 'row': y,
@@ -198,4 +198,5 @@ GROUPS = (Group('maps', measure, (
     _figure('fig6', 'size_error', 'chain', _OVER_EMPIRICAL,
             'three Gaussians'),
     _figure('fig7', 'ellipticity_error', 'chain', _OVER_EMPIRICAL,
-            'three Gaussians'))),)
+            'three Gaussians')),
+    ('fig4_to_7_maps', 'fig4_to_7_summary')),)

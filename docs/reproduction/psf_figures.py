@@ -39,8 +39,9 @@ def measure(run):
 
 
 def _stamp(run):
-    middle = (run.settings.size - 1) / 2
-    image = detector(run, 8).empirical.image_at(middle, middle)
+    ny, nx = run.settings.shape
+    image = detector(run, 8).empirical.image_at((nx - 1) / 2, (ny - 1) / 2)
+    detector(run, 8).release()
     return QTable({'sample': image})
 
 
@@ -189,16 +190,24 @@ def compare_numbers(tables):
 
 def measure_posterior(run):
     """Return the draws of the posterior of the same stamp, and a summary."""
-    image = run.table('fig1_psf', lambda: _stamp(run))
     made = []
 
     def sample():
         if not made:
-            made.append(_sample(run, cut(image['sample'])))
+            made.append(_sample(run, cut(_known_stamp(run)['sample'])))
         return made[0]
     return {'draws': run.table('appendix_a_draws', lambda: _draws(sample())),
             'summary': run.table('appendix_a_summary',
                                  lambda: sample().summary())}
+
+
+def _known_stamp(run):
+    """Return the image of Fig. 1, measured again if that has another size."""
+    path = run.folder / 'tables' / 'fig1_psf.ecsv'
+    with run.step('psf'):
+        if run.holds(path):
+            return QTable.read(path)
+    return run.table('appendix_a_psf', lambda: _stamp(run), keep=False)
 
 
 def _sample(run, stamp):
@@ -263,11 +272,13 @@ GROUPS = (
                'fit. One Gaussian has the size and ellipticity of the image '
                'by construction, because adaptive moments are those of the '
                'Gaussian that matches it best: what it lacks shows in the '
-               'residual only.', draw_numbers, compare_numbers))),
+               'residual only.', draw_numbers, compare_numbers)),
+        ('fig1_psf', 'fig3_components', 'appendix_b_numbers')),
     Group('posterior', measure_posterior, (
         Figure('appendix_a', 'Appendix A: the posterior',
                'Draws of ``sample_mixture`` with the priors of the paper: '
                'distributions on the left, traces of two chains on the '
                'right. Lengths are in pixels from the centre of the stamp.',
-               draw_posterior, compare_posterior),), random=False),
+               draw_posterior, compare_posterior),),
+        ('appendix_a_draws', 'appendix_a_summary'), random=False),
 )

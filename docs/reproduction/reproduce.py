@@ -5,7 +5,8 @@ Repeat the figures and tables of Nie et al. on simulated images.
 
 Tables (ECSV), figures (SVG and PDF) and a page, summary.rst, are written to a
 folder. What is there already, made with the same settings, is not measured
-again: a run that was stopped goes on where it was.
+again: a run that was stopped goes on where it was. What was made for other
+figures stays on the page, also where its size is another.
 Other programs are run where they are installed, and left out with a line
 where not; --peers tells how to install each.
 """
@@ -52,7 +53,8 @@ def arguments(argv=None):
                         help='where results go (%(default)s)')
     parser.add_argument('--figures', type=lambda text: text.split(','),
                         default=list(ORDER), metavar='NAMES',
-                        help=f'some of {",".join(ORDER)}')
+                        help='measure what these need, and what is measured '
+                        f'with it: some of {",".join(ORDER)}')
     parser.add_argument('--seeds', type=int, default=1, metavar='N',
                         help='draw and measure everything N times '
                         '(%(default)s)')
@@ -82,59 +84,84 @@ def main(argv=None):
         return 0
     run = Run(SIZES[options.size], options.optics, options.output,
               options.redo, options.crowdsource_python)
-    done, again = make_all(run, options.figures, True), []
-    for seed in range(1, options.seeds):
-        other = replace(run, seed=seed, skipped={}, made=[],
-                        folder=run.folder / 'partial' / f'seed_{seed}')
-        again.append((other, make_all(other, options.figures, False)))
-    summary.write(run, [done[key] for key in ORDER if key in done],
-                  [key for key in ORDER if key not in done],
-                  command(options), again)
-    for name, why in run.skipped.items():
+    for seed in range(options.seeds):
+        for group in GROUPS:
+            if any(one.key in options.figures for one in group.figures) and (
+                    seed == 0 or group.random):
+                measure(of_seed(run, seed), group)
+    parts = {group.name: found for group in GROUPS
+             if (found := stored(options, group))}
+    done, skipped = draw_all(parts)
+    summary.write(options.output, parts, done, ORDER, skipped,
+                  options.crowdsource_python)
+    for name, why in skipped.items():
         print(f'left out: {name}: {why}')
     print(f'{len(done)} figures and tables and summary.rst are in '
           f'{run.folder}')
     return 0
 
 
-def make_all(run, keys, drawn):
-    """Make the figures of all groups; return them and their lines by key."""
-    done = {}
-    for group in GROUPS:
-        chosen = [one for one in group.figures if one.key in keys]
-        if chosen and (drawn or group.random):
-            done |= make(run, group, chosen, drawn)
-    return done
+def of_seed(run, seed):
+    """Return the run that measures everything with another seed."""
+    if seed == 0:
+        return run
+    return replace(run, seed=seed, skipped={}, made=[],
+                   folder=run.folder / f'seed_{seed}')
 
 
-def make(run, group, chosen, drawn):
-    """Measure a group and draw its figures; return these and their lines."""
-    done = {}
-    with warnings.catch_warnings(), run.step(group.name), style.context(STYLE):
+def measure(run, group):
+    """Return the tables of a group, measured unless they are stored."""
+    before = len(run.made)
+    with warnings.catch_warnings(), run.step(group.name):
         # Photutils reports stars that do not converge, one by one.
         warnings.simplefilter('ignore')
         tables = group.measure(run)
-        for figure in chosen:
-            if drawn and figure.draw is not None:
-                run.figure(figure.key, figure.draw(tables))
-            done[figure.key] = figure, figure.compare(tables)
-    wall, cpu = run.costs().get(group.name, (0, 0))
-    print(f'{", ".join(done)}, seed {run.seed}: {wall:.0f} s, {cpu:.0f} s of '
-          'CPU', flush=True)
-    return done
+        wall, cpu = run.cost()
+    if len(run.made) > before:
+        print(f'{group.name}, seed {run.seed}: {wall:.0f} s, {cpu:.0f} s of '
+              'CPU', flush=True)
+    return tables
 
 
-def command(options):
-    """Return the command that makes the same results."""
-    words = ['python docs/reproduction/reproduce.py']
-    words.append(f'--size {options.size}')
-    if options.seeds > 1:
-        words.append(f'--seeds {options.seeds}')
-    if options.crowdsource_python:
-        words.append('--crowdsource-python PYTHON')
-    if len(options.figures) < len(ORDER):
-        words.append(f'--figures {",".join(options.figures)}')
-    return ' '.join(words)
+def stored(options, group):
+    """
+    Return the runs of all seeds whose tables of a group are in the folder.
+
+    They may be of another size than the one that was asked for: a folder
+    keeps what was made for other figures.
+    """
+    sizes = [options.size, *(name for name in SIZES if name != options.size)]
+    for size in sizes:
+        for optics in ('galsim', 'mixtures'):
+            run = Run(SIZES[size], optics, options.output)
+            if group.stored(run):
+                others = [of_seed(run, int(path.name.partition('_')[2]))
+                          for path in sorted(run.folder.glob('seed_*'))]
+                return [run, *(one for one in others if group.random
+                               and group.stored(one))]
+    return []
+
+
+def draw_all(parts):
+    """
+    Draw the figures of the runs of each group.
+
+    Returns by key a figure and its lines for each seed, and what was left
+    out.
+    """
+    done, skipped = {}, {}
+    for group in GROUPS:
+        tables = [measure(run, group) for run in parts.get(group.name, [])]
+        for figure in group.figures if tables else ():
+            if figure.draw is not None:
+                with style.context(STYLE):
+                    parts[group.name][0].figure(figure.key,
+                                                figure.draw(tables[0]))
+            done[figure.key] = figure, [figure.compare(one)
+                                        for one in tables]
+        for run in parts.get(group.name, ())[:1]:
+            skipped |= run.skipped
+    return done, skipped
 
 
 if __name__ == '__main__':

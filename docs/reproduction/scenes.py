@@ -4,12 +4,22 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import astropy.units as u
 import numpy as np
 from astropy.io import fits
+from astropy.table import QTable
 from photutils.background import Background2D
 from photutils.detection import DAOStarFinder
 from scipy.spatial import cKDTree
-from settings import BANDS, STAMP_RADIUS, TABLE_2_DETECTORS, effects
+from settings import (
+    BANDS,
+    DETECTOR,
+    POINT_SOURCES,
+    STAMP_RADIUS,
+    STARS,
+    TABLE_2_DETECTORS,
+    effects,
+)
 from store import Run, spread
 
 from photutils_mgauss import (
@@ -23,11 +33,14 @@ from photutils_mgauss import (
     fit_mixture_field,
     select_psf_stars,
     simulate,
+    sky_field,
     sparse_field,
 )
 
 RADIUS = 10
 FIT_SHAPE = (11, 11)
+# More pixels than the images of small runs have.
+LARGE = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -41,13 +54,13 @@ class Detector:
         The sizes.
     number : int
         Its number, which is also the seed of its aberrations.
-    size : int
-        Its side [pix].
+    shape : (ny, nx) tuple of int
+        Its pixels.
     """
 
     run: Run
     number: int
-    size: int
+    shape: tuple
 
     @property
     def band(self):
@@ -62,15 +75,14 @@ class Detector:
     @cached_property
     def light(self):
         """The PSF before the detector spreads the charge."""
-        shape = (self.size, self.size)
         seed = 1000 * self.run.seed + self.number
         if self.run.optics == 'mixtures':
-            return csst_psf(shape, self.band, rng=seed)
+            return csst_psf(self.shape, self.band, rng=seed)
         samples, nodes = self.run.settings.optics
-        optics = Optics(shape, self.band, rng=seed)
+        optics = Optics(self.shape, self.band, rng=seed)
         return optics.to_gridded_psf(nodes, n_samples=samples, radius=24)
 
-    @property
+    @cached_property
     def truth(self):
         """The PSF of faint stars, the spread of charge included."""
         return self.sparse.psf
@@ -84,15 +96,23 @@ class Detector:
 
     @cached_property
     def sparse(self):
-        """An exposure of isolated stars, with all effects."""
+        """The exposure that PSFs are made of, with all effects."""
         seed = 1000 * self.run.seed + self.number
-        stars = sparse_field((self.size, self.size),
-                             spacing=self.run.settings.spacing,
-                             rng=100_000 + seed)
+        spacing = self.run.settings.spacing
+        if spacing is None:
+            stars = paper_stars(self.shape, 100_000 + seed)
+        else:
+            stars = sparse_field(self.shape, spacing=spacing,
+                                 rng=100_000 + seed)
         return through_files(simulate(
             stars, Exposure(band=self.band, detector=self.number),
             psf=self.light, effects=effects(), rng=200_000 + seed,
-            instrument=Instrument(shape=(self.size, self.size))))
+            instrument=Instrument(shape=self.shape)))
+
+    def release(self):
+        """Free the memory of the exposure, two gigabytes of a whole one."""
+        if self.truth and np.prod(self.shape) > LARGE:
+            vars(self).pop('sparse', None)
 
     @cached_property
     def psf_stars(self):
@@ -131,25 +151,45 @@ class Detector:
     @cached_property
     def models(self):
         """The PSFs that positions are measured with, by name."""
-        return {'paper': self.chain, 'field': self.field.to_grid((20, 20))}
+        found = {'paper': self.chain, 'field': self.field.to_grid((20, 20))}
+        self.release()
+        return found
 
 
 _made = {}
 
 
-def detector(run, number, size=None):
-    """Return a detector, made once for each number and size."""
-    key = (run.fingerprint, number, size or run.settings.size, run.seed)
+def detector(run, number, shape=None):
+    """Return a detector, made once for each number and shape."""
+    key = run.settings, run.optics, run.seed, number, (
+        shape or run.settings.shape)
     if key not in _made:
-        _made[key] = Detector(run, number, key[2])
+        _made[key] = Detector(run, number, key[-1])
     return _made[key]
 
 
-def forget(size):
-    """Free the memory of the detectors of a size but those of Table 2."""
-    for key in [key for key in _made if key[2] == size
-                and key[1] not in TABLE_2_DETECTORS]:
-        del _made[key]
+def forget(one):
+    """Free the memory of a detector, unless motions are measured on it."""
+    one.release()
+    if one.number not in TABLE_2_DETECTORS:
+        for key in [key for key, value in _made.items() if value is one]:
+            del _made[key]
+
+
+def paper_stars(shape, seed):
+    """
+    Return the point sources of the paper's pointings, at random places.
+
+    Their magnitudes are those of `sky_field` in g, in every band.
+    """
+    rng = np.random.default_rng(seed)
+    number = round(POINT_SOURCES * np.prod(shape) / np.prod(DETECTOR))
+    stars = round(STARS * number)
+    table = sky_field(stars, number - stars, rng=rng)
+    ny, nx = shape
+    return QTable({'id': table['id'], 'mag': table['mag_g'],
+                   'x': rng.uniform(-0.5, nx - 0.5, number) * u.pix,
+                   'y': rng.uniform(-0.5, ny - 0.5, number) * u.pix})
 
 
 def through_files(scene):
@@ -210,10 +250,11 @@ def match(table, truth, limit=1.0):
     return np.flatnonzero(good), nearest[good]
 
 
-def cubic(x, y, size):
+def cubic(x, y, shape):
     """Return the terms of a cubic in positions on a detector, (n, 10)."""
-    u, v = (2 * np.asarray(a, float) / size - 1 for a in (x, y))
-    return np.column_stack([u**i * v**j for i in range(4)
+    across, up = (2 * np.asarray(a, float) / n - 1
+                  for a, n in zip((x, y), shape[::-1], strict=True))
+    return np.column_stack([across**i * up**j for i in range(4)
                             for j in range(4 - i)])
 
 

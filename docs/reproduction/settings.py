@@ -2,11 +2,22 @@
 from dataclasses import dataclass
 from importlib.util import find_spec
 
+import numpy as np
+
 from photutils_mgauss import DetectorEffects
 
 # The paper's stamp, 1.1 arcsec across, in pixels of 0.074 arcsec (Sec. 2.2).
 PIXEL = 0.074
 STAMP_RADIUS = 0.55 / PIXEL
+
+# The pixels of a detector (Sec. 5).
+DETECTOR = (9232, 9216)
+
+# The point sources of all pointings on one detector, from 1523 in 2.17 square
+# degrees seen in 135 pointings, and the share of stars (Sec. 2.1.2 and 4.1).
+POINT_SOURCES = round(1523 / 2.17 * 135 * DETECTOR[0] * DETECTOR[1]
+                      * (PIXEL / 3600)**2)
+STARS = 614 / (614 + 590)
 
 # The bands of the imaging detectors. Table 2 prints those of 7, 8, 9, 22, 23
 # and 24. The others are those of the survey camera of the CSST as its
@@ -43,11 +54,12 @@ class Settings:
         'quick', 'half' or 'full'.
     detectors : tuple of int
         The detectors of Figs. 4 to 7.
-    size, sky_size, crowded_size : int
-        Sides of the images of Figs. 1 to 7, 8 to 12, and 13 to 14 [pix].
-    spacing : int
+    shape, sky_shape, crowded_shape : (ny, nx) tuple of int
+        Of the images of Figs. 1 to 7, 8 to 12, and 13 to 14 [pix].
+    spacing : int or None
         One star falls on so many pixels along each axis of the exposures
-        that PSFs are made of [pix].
+        that PSFs are made of [pix]; None for the point sources of the paper,
+        of all its pointings, at random places.
     grid : int
         Places along each side of a detector in Figs. 4 to 7.
     degree : int
@@ -68,10 +80,10 @@ class Settings:
 
     name: str
     detectors: tuple
-    size: int
-    sky_size: int
-    crowded_size: int
-    spacing: int
+    shape: tuple
+    sky_shape: tuple
+    crowded_shape: tuple
+    spacing: int | None
     grid: int
     degree: int
     psf_stars: int
@@ -81,26 +93,49 @@ class Settings:
     draws: int
     optics: tuple
 
+    def of(self, step):
+        """Return what a step is told, in words that are the same again."""
+        told = ', '.join(f'{key}={getattr(self, key)!r}'
+                         for key in TOLD[step])
+        return f'size {self.name}: {told}'
+
+    @property
+    def psf_sources(self):
+        """The stars on an exposure that PSFs are made of."""
+        if self.spacing is None:
+            return POINT_SOURCES
+        return int(np.prod([n // self.spacing for n in self.shape]))
+
+
+# What the steps are told. A table is measured again where one of these is
+# another.
+_PSF = ('spacing', 'degree', 'psf_stars', 'optics')
+TOLD = {
+    'none': (), 'tables': (), 'psf': ('shape', *_PSF),
+    'posterior': ('shape', *_PSF, 'draws'),
+    'maps': ('shape', *_PSF, 'grid', 'detectors'),
+    'sky': ('sky_shape', *_PSF, 'grid', 'sources', 'references',
+            'resamplings'),
+    'crowded': ('crowded_shape', 'sky_shape', *_PSF, 'grid')}
 
 QUICK = Settings(
-    name='quick', detectors=(8, 12), size=384, sky_size=384,
-    crowded_size=160, spacing=40, grid=4, degree=1, psf_stars=60,
+    name='quick', detectors=(8, 12), shape=(384, 384), sky_shape=(384, 384),
+    crowded_shape=(160, 160), spacing=40, grid=4, degree=1, psf_stars=60,
     sources=(60, 60), references=30, resamplings=500, draws=100,
     optics=(2, 2))
 
 HALF = Settings(
     name='half', detectors=(6, 7, 8, 9, 11, 12, 14, 22, 23, 24),
-    size=512, sky_size=512,
-    crowded_size=256, spacing=36, grid=8, degree=2, psf_stars=150,
+    shape=(512, 512), sky_shape=(512, 512),
+    crowded_shape=(256, 256), spacing=36, grid=8, degree=2, psf_stars=150,
     sources=(160, 150), references=60, resamplings=2000, draws=300,
     optics=(3, 3))
 
-# 58 x 58 stars on a detector are those of the paper's 135 pointings.
 FULL = Settings(
-    name='full', detectors=tuple(BANDS), size=9216, sky_size=9216,
-    crowded_size=2304, spacing=158, grid=30, degree=3, psf_stars=1500,
+    name='full', detectors=tuple(BANDS), shape=DETECTOR, sky_shape=DETECTOR,
+    crowded_shape=(2308, 2304), spacing=None, grid=30, degree=3, psf_stars=1500,
     sources=(614, 590), references=100, resamplings=10000, draws=1000,
-    optics=(8, 15))
+    optics=(8, 11))
 
 SIZES = {one.name: one for one in (QUICK, HALF, FULL)}
 

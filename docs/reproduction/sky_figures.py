@@ -37,12 +37,11 @@ def draw_epochs(tables):
                         cmap=canvas_colours(8), linewidths=0)
     canvas.colorbar(dots, ax=left, ticks=range(8),
                     label='exposures that show a source')
-    size = run.settings.sky_size
-    corner = np.array([0, size, size, 0, 0]) - 0.5
+    ny, nx = run.settings.sky_shape
+    corners = np.array([[0, nx, nx, 0, 0], [0, 0, ny, ny, 0]]) - 0.5
     for k, taken in enumerate(exposures(run)):
-        wcs = taken.wcs((size, size), PIXEL)
-        left.plot(*wcs(corner, np.roll(corner[:4], 1)[[0, 1, 2, 3, 0]],
-                       with_bounding_box=False), color=COLOURS[k],
+        wcs = taken.wcs((ny, nx), PIXEL)
+        left.plot(*wcs(*corners, with_bounding_box=False), color=COLOURS[k],
                   label=f'{taken.time.utc.isot[:10]} {taken.band.name}')
     left.set(xlabel='right ascension [deg]', ylabel='declination [deg]')
     left.invert_xaxis()
@@ -64,7 +63,7 @@ def draw_epochs(tables):
 def compare_epochs(tables):
     """Compare the numbers of sources."""
     kinds = tables['found']['kind']
-    side = tables['run'].settings.sky_size * PIXEL / 60
+    side = min(tables['run'].settings.sky_shape) * PIXEL / 60
     return [Comparison('stars and quasars', '614 and 590',
                        f'{np.sum(kinds == "star")} and '
                        f'{np.sum(kinds == "qso")}'),
@@ -298,4 +297,6 @@ GROUPS = (Group('sky', measure, (
            'Joint solution. Top: median stated error, which contains that of '
            'the frame, with the 1-sigma range of the bootstrap. Bottom: the '
            'median motion, whose true value is zero, and its bootstrap '
-           'error.', draw_bins, compare_bins))),)
+           'error.', draw_bins, compare_bins)),
+    ('fig8_found', 'fig8_epochs', 'fig9_10_positions', 'fig11_medians',
+     'fig11_by_magnitude', 'fig12_bins')),)

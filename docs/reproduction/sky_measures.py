@@ -1,5 +1,5 @@
 """Seven exposures of stars and quasars: what Figs. 8 to 12 show."""
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import astropy.units as u
 import numpy as np
@@ -39,7 +39,7 @@ REFERENCE_ERROR, PLACE_ERROR = 0.1, 0.5
 
 def sources(run):
     """Return stars and quasars on the sky, with motions and parallaxes."""
-    arcmin = run.settings.sky_size * PIXEL / 60
+    arcmin = min(run.settings.sky_shape) * PIXEL / 60
     return sky_field(*run.settings.sources, size=arcmin, separation=1.2,
                      rng=31 + 1000 * run.seed)
 
@@ -52,24 +52,36 @@ def exposures(run):
 
 def measure(run):
     """Return what the seven exposures give."""
-    catalogues = {(number, name): run.table(
-        f'epoch_{number}_{name}',
-        lambda number=number, name=name: _observe(run, number, name),
-        keep=False) for number in range(7) for name in MODELS}
-    found = run.table('fig8_found', lambda: _found(run, catalogues),
-                      keep=False)
-    positions = run.table('fig9_10_positions',
-                          lambda: _positions(run, catalogues))
-    motions = run.table('fig11_motions',
-                        lambda: _motions(run, catalogues), keep=False)
-    return {'found': found, 'positions': positions, 'run': run,
+    catalogues = Catalogues(run)
+
+    def motions():
+        return run.table('motions', lambda: _motions(run, catalogues),
+                         keep=False)
+    return {'run': run,
+            'found': run.table('fig8_found',
+                               lambda: _found(run, catalogues)),
             'epochs': run.table('fig8_epochs',
                                 lambda: _epochs(run, catalogues)),
+            'positions': run.table('fig9_10_positions',
+                                   lambda: _positions(run, catalogues)),
             'medians': run.table('fig11_medians',
-                                 lambda: _medians(run, motions)),
+                                 lambda: _medians(run, motions())),
             'by_magnitude': run.table('fig11_by_magnitude',
-                                      lambda: _by_magnitude(motions)),
-            'bins': run.table('fig12_bins', lambda: _bins(run, motions))}
+                                      lambda: _by_magnitude(motions())),
+            'bins': run.table('fig12_bins', lambda: _bins(run, motions()))}
+
+
+@dataclass(frozen=True)
+class Catalogues:
+    """What was measured of each exposure, by its number and the model."""
+
+    run: object
+
+    def __getitem__(self, key):
+        number, name = key
+        return self.run.table(
+            f'epoch_{number}_{name}',
+            lambda: _observe(self.run, number, name), keep=False)
 
 
 # Positions
@@ -79,22 +91,22 @@ _scenes = {}
 
 def _scene(run, number):
     """Return one exposure of the field."""
-    key = run.fingerprint, run.seed, number
+    key = run.fingerprint, number
     if key not in _scenes:
         _scenes.clear()
-        exposure, size = exposures(run)[number], run.settings.sky_size
-        one = detector(run, exposure.detector, size)
+        exposure, shape = exposures(run)[number], run.settings.sky_shape
+        one = detector(run, exposure.detector, shape)
         _scenes[key] = through_files(simulate(
             sources(run), exposure, psf=one.light, effects=effects(),
             rng=300 + number + 1000 * run.seed,
-            instrument=Instrument(shape=(size, size))))
+            instrument=Instrument(shape=shape)))
     return _scenes[key]
 
 
 def _observe(run, number, name):
     """Return the catalogue of one exposure, from its pixels alone."""
     one = detector(run, exposures(run)[number].detector,
-                   run.settings.sky_size)
+                   run.settings.sky_shape)
     table = catalogue(_scene(run, number), one.models[name])
     out = QTable({column: np.asarray(table[column], float) for column in
                   ('x_fit', 'x_err', 'y_fit', 'y_err', 'flux_fit')})
@@ -111,7 +123,7 @@ def _nominal(run, number):
 
 def _epoch(run, table, number):
     """Return what the fitter is given of one exposure."""
-    taken, shape = _nominal(run, number), (run.settings.sky_size,) * 2
+    taken, shape = _nominal(run, number), run.settings.sky_shape
     return Epoch(Table({name: table[name] for name in table.colnames
                         if name != 'id'}),
                  taken.wcs(shape, PIXEL), taken.time)
@@ -150,7 +162,7 @@ def _solve(run, catalogues, name, which):
 def _true_places(run, number):
     """Return where sources are on the sky at an epoch, aberration apart."""
     ideal = replace(_nominal(run, number), aberration=False)
-    shape, truth = (run.settings.sky_size,) * 2, sources(run)
+    shape, truth = run.settings.sky_shape, sources(run)
     x, y = ideal.pixels(truth, shape, PIXEL)
     ra, dec = ideal.wcs(shape, PIXEL)(x, y, with_bounding_box=False)
     return SkyCoord(ra, dec, unit='deg')

@@ -1,5 +1,6 @@
 """Tables and figures in a folder, each made once for the same settings."""
 import datetime as dt
+import json
 import platform
 import resource
 import shutil
@@ -17,6 +18,11 @@ from astropy.table import QTable, Table
 
 PACKAGES = ('photutils_mgauss', 'numpy', 'scipy', 'numba', 'astropy',
             'photutils', 'gwcs', 'pymc', 'matplotlib', 'galsim', 'sep')
+
+
+# What all tables of a folder were made with and cost, those that are not
+# kept, too.
+NOTES = 'measured.json'
 
 
 @dataclass(frozen=True)
@@ -43,7 +49,10 @@ class Run:
     made : list of str
         The tables that this call has measured; filled on the way.
     steps : list of str
-        The step that is under way, in a list; changed on the way.
+        The steps that are under way, the last one now; changed on the way.
+    within : list of float
+        Wall and CPU time [s] of the tables that were measured within the one
+        that is under way; changed on the way.
     """
 
     settings: object
@@ -55,30 +64,43 @@ class Run:
     skipped: dict = field(default_factory=dict)
     made: list = field(default_factory=list)
     steps: list = field(default_factory=lambda: ['none'])
+    within: list = field(default_factory=lambda: [0.0, 0.0])
 
     @property
     def fingerprint(self):
         """What a stored table must have been made with to be used again."""
-        return f'{self.settings}, optics={self.optics!r}, seed={self.seed}'
+        return (f'{self.settings.of(self.steps[-1])}, '
+                f'optics={self.optics!r}, seed={self.seed}')
 
     def table(self, name, function, *, keep=True):
-        """Return a stored table, or measure and store it."""
+        """
+        Return a stored table, or measure and store it.
+
+        Those that are not kept are needed only to measure others from.
+        """
         path = self.folder / ('tables' if keep else 'partial') / f'{name}.ecsv'
-        if path.exists() and not self.redo:
-            found = QTable.read(path)
-            if found.meta.get('settings') == self.fingerprint:
-                return found
+        if (not self.redo or name in self.made) and self.holds(path):
+            return QTable.read(path)
         self.made.append(name)
-        before = time.perf_counter(), _cpu_seconds()
+        before, outer = (time.perf_counter(), _cpu_seconds()), self.within[:]
+        self.within[:] = 0.0, 0.0
         # What is measured again from must keep all its digits.
         table = _rounded(function()) if keep else QTable(function())
-        table.meta |= {
-            'settings': self.fingerprint, 'step': self.steps[-1],
-            'wall': round(time.perf_counter() - before[0], 2),
-            'cpu': round(_cpu_seconds() - before[1], 2), **provenance()}
+        spent = time.perf_counter() - before[0], _cpu_seconds() - before[1]
+        # The tables that were measured on the way have their own costs.
+        wall, cpu = np.subtract(spent, self.within).round(2).tolist()
+        self.within[:] = np.add(outer, spent)
+        note = {'settings': self.fingerprint, **provenance()}
+        table.meta |= note
         path.parent.mkdir(parents=True, exist_ok=True)
         table.write(path, overwrite=True)
+        self._note(name, {**note, 'wall': wall, 'cpu': cpu})
         return table
+
+    def holds(self, path):
+        """Whether a table is stored that has what this step is told."""
+        return path.exists() and (
+            _settings(path, path.stat().st_mtime_ns) == self.fingerprint)
 
     def figure(self, name, figure):
         """Store a figure as vectors, in the two formats that journals take."""
@@ -96,32 +118,38 @@ class Run:
         finally:
             self.steps.pop()
 
-    def stored(self):
-        """Return what is written above each table of these settings."""
-        found = [_notes(path, path.stat().st_mtime_ns)
-                 for kind in ('tables', 'partial')
-                 for path in sorted((self.folder / kind).glob('*.ecsv'))]
-        return [one for one in found
-                if one.get('settings') == self.fingerprint]
+    def _note(self, name, note):
+        """Keep what a table was made with and its cost, whatever its fate."""
+        path = self.folder / NOTES
+        notes = _read_notes(path)
+        notes[name] = note
+        path.write_text(json.dumps(notes, indent=0, sort_keys=True) + '\n')
 
-    def costs(self):
-        """
-        Return wall and CPU time [s] by the name of the step.
+    def notes(self):
+        """Return what is noted of each table of the step under way."""
+        return [one for one in _read_notes(self.folder / NOTES).values()
+                if one['settings'] == self.fingerprint]
 
-        They are summed over the tables of a step, so that a run that was
-        stopped and went on counts all its parts.
+    def cost(self):
         """
-        found = {}
-        for one in self.stored():
-            wall, cpu = found.get(one['step'], (0.0, 0.0))
-            found[one['step']] = wall + one['wall'], cpu + one['cpu']
-        return found
+        Return wall and CPU time [s] of the step under way.
+
+        They are summed over its tables, so that a run that was stopped and
+        went on counts all its parts.
+        """
+        notes = self.notes()
+        return tuple(sum(one[key] for one in notes)
+                     for key in ('wall', 'cpu'))
+
+
+def _read_notes(path):
+    return json.loads(path.read_text()) if path.exists() else {}
 
 
 @cache
-def _notes(path, _changed):
-    """Return what is written above a table, read once while it is as it is."""
-    return QTable.read(path).meta
+def _settings(path, _changed):
+    """Return what a table was made with, read once while it is as it is."""
+    return QTable.read(path).meta.get('settings')
 
 
 def _cpu_seconds():
@@ -254,13 +282,21 @@ class Group:
     """
     Figures that are drawn from the same measurement.
 
-    ``random`` tells whether another seed changes it.
+    ``tables`` names those that figures and page are made from, and
+    ``random`` tells whether another seed changes them.
     """
 
     name: str
     measure: object
     figures: tuple
+    tables: tuple
     random: bool = True
+
+    def stored(self, run):
+        """Whether all tables are stored that the figures are made from."""
+        with run.step(self.name):
+            return all(run.holds(run.folder / 'tables' / f'{name}.ecsv')
+                       for name in self.tables)
 
 
 def binned(magnitude, edges):

@@ -8,19 +8,20 @@ from settings import FULL
 from store import PACKAGES
 
 _HEAD = """\
-{title}
-{rule}
+The paper reproduced: results
+=============================
 
 .. This page is written by docs/reproduction/reproduce.py.
 
-Measured on {date} by
+Each figure says of which size its run was, when it was measured and by which
+revision; others were on the machine:
 
-{versions}
-
-with ``{command}``.
+{versions}.
 
 {sizes}
 
+The true PSF of the images is {optics}. The whole variation of the PSF over a
+detector is in each image, also in small ones.
 All effects of the detectors that the paper lists are on in all images, and
 are calibrated and masked as :doc:`/simulation` says.
 {repel}
@@ -30,7 +31,11 @@ settings in their headers.
 A judgement is *reached* only where our number is not larger than the printed
 one, the method is that of the paper and the images have its size; *better, in
 a smaller field* where only the size differs; *better by another method* where
-the number is that of a method which the paper does not use. {seeds}
+the number is that of a method which the paper does not use. Where another
+seed was drawn and measured, the column *again* has its numbers, and *spread*
+is what the two say of the standard deviation of one, their difference over
+the root of 2; where it is missing there is one seed, and another one gives
+other numbers.
 
 {skipped}
 
@@ -50,32 +55,63 @@ _OPTICS = {
 }
 
 
-def write(run, done, missing, command, again):
-    """Write the page of the figures that were made."""
-    parts = [_head(run, missing, command, [other for other, _ in again])]
-    for figure, lines in done:
-        others = [one[figure.key][1] for _, one in again if figure.key in one]
-        parts.append(_section(run, figure, lines, others, command))
-    (run.folder / 'summary.rst').write_text('\n'.join(parts))
+def write(folder, parts, done, order, skipped, crowdsource_python=None):
+    """
+    Write the page of the figures whose tables are in a folder.
+
+    Parameters
+    ----------
+    folder : `~pathlib.Path`
+        Where results are.
+    parts : dict
+        The runs of all seeds, the one that is shown first, by group.
+    done : dict
+        A figure and its lines for each seed, by key.
+    order : tuple of str
+        The keys of all figures, in the order of the page.
+    skipped : dict
+        What was left out, and why.
+    crowdsource_python : str or None
+        An interpreter that has crowdsource.
+    """
+    page = [_head(parts, [key for key in order if key not in done], skipped,
+                  crowdsource_python)]
+    of_figure = {figure: name for name, figures in FIGURES_OF.items()
+                 for figure in figures}
+    for key in order:
+        if key in done:
+            name = of_figure[key]
+            page.append(_section(folder, parts[name], name, *done[key]))
+    (folder / 'summary.rst').write_text('\n'.join(page))
 
 
-def _head(run, missing, command, others):
-    seeds = ('Everything was drawn and measured twice: the column *again* has '
-             'the numbers of the second seed, and *spread* is what the two '
-             'say of the standard deviation of one, their difference over '
-             'the root of 2.' if others else
-             'There is one seed: another one gives other numbers.')
+def _head(parts, missing, skipped, crowdsource_python):
+    notes = _notes(parts)
+    optics = sorted({run.optics for runs in parts.values() for run in runs})
+    versions = {name: _values(notes, name) for name in (
+        'python', *PACKAGES) if name != 'photutils_mgauss'}
+    versions |= program_versions(crowdsource_python)
     repel = ('Charge repels charge (brighter-fatter) in all of them.'
-             if run.optics == 'galsim' else
-             'The brighter-fatter effect is off, because GalSim is not '
+             if optics == ['galsim'] else
+             'The brighter-fatter effect is off where GalSim is not '
              'installed.')
-    notes = [note for one in (run, *others) for note in one.stored()]
-    title = f'The paper reproduced: results, size {run.settings.name}'
     return _HEAD.format(
-        title=title, rule='=' * len(title), date=_values(notes, 'date'),
-        command=command, versions=_filled(_versions(run, notes)),
-        sizes=_filled(_sizes(run)), skipped=_skipped(run, missing),
-        seeds=seeds, repel=repel, costs=_costs(run, others))
+        versions=_filled(', '.join(f'{name} {value}' for name, value in
+                                   versions.items() if value)),
+        sizes=_sizes(parts), repel=repel,
+        optics=_filled(', or '.join(_OPTICS[one] for one in optics)),
+        skipped=_skipped(skipped, missing), costs=_costs(parts))
+
+
+def _notes(parts):
+    """Return what is noted of the tables of all runs."""
+    return [note for name, runs in parts.items() for run in runs
+            for note in _of(name, run)]
+
+
+def _of(name, run):
+    with run.step(name):
+        return run.notes()
 
 
 def _values(notes, name):
@@ -84,48 +120,82 @@ def _values(notes, name):
                                 if name in note}))
 
 
-def _versions(run, notes):
-    """Return the versions of the code that measured the tables."""
-    found = {name: _values(notes, name) for name in ('python', *PACKAGES)}
-    found |= program_versions(run.crowdsource_python)
-    return ', '.join(f'{name} {value}' for name, value in found.items()
-                     if value)
+def _sizes(parts):
+    """Return a table of what was simulated, and of what the paper has."""
+    rows = ['.. list-table::', '   :header-rows: 1', '   :widths: 16 10 37 37',
+            '']
+    rows += _row(['Figures', 'Size', 'This page', 'The paper'])
+    for name, (figures, ours, paper) in SIZES_OF.items():
+        if name in parts:
+            settings = parts[name][0].settings
+            rows += _row([figures, settings.name, ours(settings), paper])
+    return '\n'.join(rows)
 
 
-def _sizes(run):
-    """Return the size of this run, in words."""
-    s = run.settings
-    n = (s.size // s.spacing)**2
-    return (
-        f'This is the size *{s.name}*. The true PSF of the images is '
-        f'{_OPTICS[run.optics]}. Images have {s.size} pixels on a side in '
-        f'Figs. 1 to 7, with {s.grid} x {s.grid} places on each of '
-        f'{len(s.detectors)} detectors (the paper: 9216, 30 x 30 and 18); '
-        f'{s.sky_size} in Figs. 8 to 12, with {s.sources[0]} stars and '
-        f'{s.sources[1]} quasars, of which {s.references} are references '
-        f'(9216, 614, 590 and 100); {s.crowded_size} in Figs. 13 and 14 '
-        f'(9216). The whole variation of the PSF over a detector is in each. '
-        f'A PSF is made of those of {n} stars that are bright and apart, at '
-        f'most {s.psf_stars} (the stars of 135 pointings: about 3400).')
+def _square(shape):
+    return f'{shape[1]} x {shape[0]} pixels'
 
 
-def _costs(run, others):
+def _stars(s):
+    """Return what a PSF is made of, in words."""
+    field = ('at random places, with the magnitudes of ``sky_field``'
+             if s.spacing is None else
+             'apart, of which 28 % are of 18 to 20.5 mag')
+    return (f'the PSF from those of {s.psf_sources} stars {field}, that are '
+            f'bright and alone, at most {s.psf_stars}')
+
+
+# By group: its figures; its size; that of the paper.
+SIZES_OF = {
+    'psf': ('1 to 3, Appendix B', lambda s: (
+        f'{_square(s.shape)}; {_stars(s)}'), '9216 x 9232 pixels; the point '
+        'sources of 135 pointings, about 3400 a detector'),
+    'posterior': ('Appendix A', lambda s: (
+        f'the same; two chains of {s.draws} draws'), 'one PSF'),
+    'maps': ('4 to 7', lambda s: (
+        f'{len(s.detectors)} detectors of {_square(s.shape)}, {s.grid} x '
+        f'{s.grid} places on each; {_stars(s)}'),
+        '18 detectors, 30 x 30 places on each'),
+    'sky': ('8 to 12', lambda s: (
+        f'{_square(s.sky_shape)}, {s.sources[0]} stars and {s.sources[1]} '
+        f'quasars, of which {s.references} are references; {_stars(s)}; '
+        f'bootstraps of {s.resamplings}'),
+        '9216 x 9232 pixels, 614 stars and 590 quasars, 100 references; '
+        'bootstraps of 10000'),
+    'crowded': ('13 and 14', lambda s: (
+        f'{_square(s.crowded_shape)} with the density of the paper; '
+        f'{_stars(s)}'), '9216 x 9232 pixels with 5.4 million stars'),
+}
+
+# The figures of the groups.
+FIGURES_OF = {
+    'tables': ('table1', 'table2'),
+    'psf': ('fig1', 'fig2', 'fig3', 'appendix_b'),
+    'posterior': ('appendix_a',), 'maps': ('fig4', 'fig5', 'fig6', 'fig7'),
+    'sky': ('fig8', 'fig9', 'fig10', 'fig11', 'fig12'),
+    'crowded': ('fig13', 'fig14')}
+
+
+def _costs(parts):
     """Return the table of what steps cost, seed by seed."""
-    each = [one.costs() for one in (run, *others)]
-    rows = ['.. list-table::', '   :header-rows: 1', '', '   * - Step']
-    for one in (run, *others):
-        rows += [f'     - Wall, seed {one.seed} [s]',
-                 f'     - CPU, seed {one.seed} [s]']
-    rows.append('     - CPU of a full run, estimated [h]')
-    costs = [(name, *np.ravel([one.get(name, (np.nan, np.nan))
-                               for one in each]),
-              each[0][name][1] * full_work(name, run.settings) / 3600)
-             for name in sorted(each[0])]
-    total = np.nansum([one[1:] for one in costs], axis=0)
-    for name, *seconds, hours in [*costs, ('together', *total)]:
-        rows += [f'   * - {name}', *(
-            f'     - {one:.0f}' if np.isfinite(one) else '     -'
-            for one in seconds), f'     - {hours:.2f}']
+    seeds = max(len(runs) for runs in parts.values())
+    rows = ['.. list-table::', '   :header-rows: 1', '']
+    rows += _row(['Step', 'Size', *(f'{kind}, seed {k} [s]' for k in
+                                    range(seeds) for kind in ('Wall', 'CPU')),
+                  'CPU of a full run [h]'])
+    total = 0.0
+    for name, runs in sorted(parts.items()):
+        cells, settings = [], runs[0].settings
+        for run in runs:
+            with run.step(name):
+                cells += run.cost()
+        hours = cells[1] * full_work(name, settings) / 3600
+        total += hours
+        words = [f'{one:.0f}' for one in cells]
+        words += [''] * (2 * seeds - len(cells))
+        rows += _row([name, settings.name, *words, f'{hours:.2f}' + (
+            '' if settings is FULL or name == 'tables' else ', estimated')])
+    rows += _row(['together', '', *[''] * (2 * seeds), f'{total:.2f}'])
     return '\n'.join(rows)
 
 
@@ -136,9 +206,8 @@ def full_work(name, settings):
     Noise and detection go with pixels, and fits of PSFs with the stars that
     make them; the crowded field goes with its area.
     """
-    stars = (FULL.size // FULL.spacing)**2 / (
-        settings.size // settings.spacing)**2
-    pixels = (FULL.size / settings.size)**2
+    stars = FULL.psf_sources / settings.psf_sources
+    pixels = np.prod(FULL.shape) / np.prod(settings.shape)
     maps = (FULL.grid / settings.grid)**2
     share = len(FULL.detectors) / len(settings.detectors)
     # Of a detector, a tenth is pixels, a third grids, the rest stars.
@@ -147,33 +216,41 @@ def full_work(name, settings):
             'psf': detector, 'maps': detector * share,
             'sky': 0.1 * pixels + 0.9 * sum(FULL.sources) / sum(
                 settings.sources),
-            'crowded': (FULL.crowded_size / settings.crowded_size)**2}[name]
+            'crowded': np.prod(FULL.crowded_shape) / np.prod(
+                settings.crowded_shape)}[name]
 
 
 def _filled(text, width=78):
     return textwrap.fill(text, width, break_long_words=False)
 
 
-def _skipped(run, missing):
-    lines = [f'* {name}: {why}.' for name, why in run.skipped.items()]
+def _skipped(skipped, missing):
+    lines = [f'* {name}: {why}.' for name, why in skipped.items()]
     if missing:
-        lines.append(f'* {", ".join(missing)}: not asked for.')
+        lines.append(f'* {", ".join(missing)}: not measured.')
     return '\n'.join(['Left out:', '', *lines] if lines
                      else ['Nothing was left out.'])
 
 
-def _section(run, figure, lines, others, command):
-    base, _, _ = command.partition(' --figures')
-    own = f'{base} --figures {figure.key}'
+def _section(folder, runs, name, figure, lines):
+    """Return the part of the page that is about a figure."""
+    notes = [note for run in runs for note in _of(name, run)]
+    command = (f'python docs/reproduction/reproduce.py --size '
+               f'{runs[0].settings.name} --figures {figure.key}')
+    if len(runs) > 1:
+        command += f' --seeds {len(runs)}'
     rows = [figure.title, '-' * len(figure.title), '', _filled(figure.text),
-            '', f'Made by ``{own}``.', '']
+            '', _filled(f'Size *{runs[0].settings.name}*, measured on '
+                        f'{_values(notes, "date")} by '
+                        f'{_values(notes, "photutils_mgauss")}, with '
+                        f'``{command}``.'), '']
     if figure.draw is not None:
         rows += [f'.. image:: figures/{figure.key}.svg',
                  f'   :alt: {figure.title}', '',
                  f':download:`As PDF <figures/{figure.key}.pdf>`.', '']
-    if lines:
-        rows += _table(lines, others)
-    tables = sorted(path.name for path in (run.folder / 'tables').glob(
+    if lines[0]:
+        rows += _table(lines[0], lines[1:])
+    tables = sorted(path.name for path in (folder / 'tables').glob(
         f'{_prefix(figure.key)}*.ecsv'))
     if tables:
         rows.append('Tables: ' + ', '.join(

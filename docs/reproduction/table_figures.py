@@ -81,4 +81,4 @@ GROUPS = (Group('tables', measure, (
            'The defaults of ``Instrument``.', None, compare_instrument),
     Figure('table2', 'Table 2: the exposures',
            'Those of ``paper_exposures``.', None, compare_exposures)),
-    random=False),)
+    ('table1_instrument', 'table2_exposures'), random=False),)

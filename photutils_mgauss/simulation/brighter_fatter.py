@@ -4,7 +4,7 @@ Stars photon by photon, where charge pushes later charge away.
 GalSim's model of a silicon sensor moves the edges of pixels with the charge
 they hold, which makes bright stars wider than faint ones.
 """
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from photutils.psf import GriddedPSFModel
@@ -88,7 +88,6 @@ class OpticsPhotons:
 
     psf: GriddedPSFModel
     oversampling: int = 4
-    _nodes: dict = field(default_factory=dict, init=False)
 
     def __call__(self, x, y, number, rng):
         """Draw places (2, number) relative to a star at x, y [pix]."""
@@ -113,12 +112,16 @@ class OpticsPhotons:
 
     def _at_node(self, node, number, rng):
         """Draw places (2, number) from the light at a node."""
-        if node not in self._nodes:
-            light = self.psf.meta['optics'].light(
-                *node, oversampling=self.oversampling, radius=_HALF)
+        # Drawing takes long, and other exposures have the same nodes.
+        drawn = self.psf.meta.setdefault('photons', {})
+        optics = self.psf.meta['optics']
+        key = (optics.diffusion, self.oversampling, node)
+        if key not in drawn:
+            light = optics.light(*node, oversampling=self.oversampling,
+                                 radius=_HALF)
             total = np.cumsum(np.maximum(light, 0))
-            self._nodes[node] = total / total[-1]
-        chosen = np.searchsorted(self._nodes[node], rng.random(number),
+            drawn[key] = total / total[-1]
+        chosen = np.searchsorted(drawn[key], rng.random(number),
                                  side='right')
         side = 2 * _HALF * self.oversampling + 1
         row, column = np.divmod(chosen, side)

@@ -111,4 +111,6 @@ def widen(psf, stddev):
         optics = psf.meta['optics']
         meta['optics'] = replace(optics, diffusion=float(np.hypot(
             optics.diffusion, stddev * optics.pixel_scale)))
+        # What photons are drawn from serves other exposures, too.
+        meta['photons'] = psf.meta.setdefault('photons', {})
     return GriddedPSFModel(NDData(np.array(images), meta=meta))
