@@ -2,6 +2,8 @@
 import os
 import subprocess
 import sys
+import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +21,18 @@ def store(monkeypatch):
     return store
 
 
+@dataclass(frozen=True)
+class Sizes:
+    """Settings of a name that tell all steps the same."""
+
+    name: str
+
+    def of(self, _):
+        return self.name
+
+
 def make_run(store, folder, **options):
-    return store.Run('small', 'mixtures', folder, **options)
+    return store.Run(Sizes('small'), 'mixtures', folder, **options)
 
 
 def table_of(value):
@@ -54,7 +66,7 @@ def test_a_stored_table_is_used_again(store, tmp_path):
 @pytest.mark.parametrize('options', [{'redo': True}, {}])
 def test_a_table_is_measured_again_when_it_must_be(store, tmp_path, options):
     make_run(store, tmp_path).table('one', lambda: table_of(1.0))
-    settings = 'small' if options else 'large'
+    settings = Sizes('small' if options else 'large')
     run = store.Run(settings, 'mixtures', tmp_path, **options)
     assert run.table('one', lambda: table_of(2.0))['value'][0] == 2
 
@@ -111,11 +123,48 @@ def test_a_step_that_finds_everything_keeps_its_first_cost(store, tmp_path):
     run = make_run(store, tmp_path)
     with run.step('one'):
         run.table('one', lambda: table_of(sum(range(2_000_000))))
-    first = run.costs()
-    with run.step('one'):
+        first = run.cost()
         run.table('one', lambda: table_of(2.0))
-    assert run.costs() == first
-    assert first['one'][0] > 0
+        assert run.cost() == first
+    assert first[0] > 0
+
+
+def test_a_table_that_needs_another_does_not_count_its_cost(store, tmp_path):
+    run = make_run(store, tmp_path)
+
+    def inner():
+        time.sleep(0.3)
+        return table_of(1.0)
+    run.table('outer', lambda: run.table('inner', inner, keep=False))
+    assert 0.3 <= run.cost()[0] < 0.5
+    # The cost of what is not kept stays known.
+    (tmp_path / 'partial' / 'inner.ecsv').unlink()
+    assert run.cost()[0] >= 0.3
+
+
+def test_measuring_again_does_so_once(store, tmp_path):
+    run = make_run(store, tmp_path, redo=True)
+    run.table('one', lambda: table_of(1.0))
+    assert run.table('one', lambda: table_of(2.0))['value'][0] == 1
+
+
+@pytest.mark.usefixtures('store')
+def test_other_settings_of_one_step_do_not_measure_others_again():
+    from dataclasses import replace
+
+    from settings import FULL
+    other = replace(FULL, crowded_shape=(10, 10))
+    assert other.of('sky') == FULL.of('sky')
+    assert other.of('crowded') != FULL.of('crowded')
+
+
+@pytest.mark.usefixtures('store')
+def test_every_step_is_told_all_that_it_may_read():
+    import reproduce
+    from settings import FULL, TOLD
+    assert {group.name for group in reproduce.GROUPS} < set(TOLD)
+    told = {name for names in TOLD.values() for name in names}
+    assert told | {'name'} == set(vars(FULL))
 
 
 def test_seeds_do_not_share_tables(store, tmp_path):
@@ -272,12 +321,80 @@ def test_the_page_says_what_each_seed_costs_and_which_code_ran(store,
     for run in runs:
         with run.step('sky'):
             run.table('one', lambda: table_of(sum(range(100_000))))
-    summary.write(runs[0], [], [], 'COMMAND', [(runs[1], {})])
-    page = (runs[0].folder / 'summary.rst').read_text()
-    for words in ('Wall, seed 0 [s]', 'CPU, seed 1 [s]', 'COMMAND',
+    figure = store.Figure('fig8', 'Fig. 8', 'Words.', None)
+    lines = [store.Comparison('error', '1 mas', '0.5 mas', 'better')]
+    summary.write(tmp_path, {'sky': runs},
+                  {'fig8': ('sky', figure, [lines, lines])},
+                  ('fig8', 'fig9'), {'DOLPHOT': 'not there'})
+    page = ' '.join((tmp_path / 'summary.rst').read_text().split())
+    for words in ('Wall, seed 0 [s]', 'CPU, seed 1 [s]', 'Size *quick*',
+                  '--size quick --figures fig8 --seeds 2',
                   store.versions()['photutils_mgauss'],
-                  store.provenance()['date'], 'drawn and measured twice'):
-        assert words in ' '.join(page.split())
+                  store.provenance()['date'], 'DOLPHOT: not there',
+                  'fig9: not measured'):
+        assert words in page
+
+
+def stored(folder, size, name, seed=0):
+    """Write tables of a group as if measured; return its name and run."""
+    import reproduce
+    import settings
+    run = reproduce.of_seed(reproduce.Run(settings.SIZES[size], 'galsim',
+                                          folder), seed)
+    group, = (one for one in reproduce.GROUPS if one.name == name)
+    with run.step(name):
+        for table in group.tables:
+            run.table(table, lambda: table_of(1.0))
+    return group
+
+
+@pytest.mark.usefixtures('store')
+def test_a_folder_keeps_what_other_sizes_made_for_other_figures(tmp_path):
+    import reproduce
+    sky = stored(tmp_path, 'half', 'sky')
+    maps = stored(tmp_path, 'full', 'maps')
+    stored(tmp_path, 'full', 'maps', seed=1)
+    options = reproduce.arguments(['--quick', '--output', str(tmp_path)])
+    found = {group.name: [(run.settings.name, run.seed) for run in
+                          reproduce.stored(options, group)]
+             for group in reproduce.GROUPS}
+    assert found[sky.name] == [('half', 0)]
+    assert found[maps.name] == [('full', 0), ('full', 1)]
+    assert found['crowded'] == []
+
+
+@pytest.mark.usefixtures('store')
+def test_a_group_of_which_tables_are_missing_is_not_on_the_page(tmp_path):
+    import reproduce
+    group = stored(tmp_path, 'full', 'crowded')
+    (tmp_path / 'tables' / f'{group.tables[-1]}.ecsv').unlink()
+    options = reproduce.arguments(['--output', str(tmp_path)])
+    assert reproduce.stored(options, group) == []
+
+
+@pytest.mark.usefixtures('store')
+def test_a_whole_detector_has_the_point_sources_of_the_paper():
+    from scenes import paper_stars
+    from settings import DETECTOR, FULL
+    stars = paper_stars(DETECTOR, 1)
+    # 1523 in 2.17 square degrees, seen in 135 pointings.
+    assert len(stars) == pytest.approx(3406, abs=2)
+    assert FULL.psf_sources == len(stars)
+    assert len(paper_stars((4616, 9216), 1)) == pytest.approx(1703, abs=1)
+    assert stars['x'].value.max() > 9200 > 100 > stars['x'].value.min()
+
+
+@pytest.mark.usefixtures('store')
+def test_the_page_of_the_committed_results_is_that_of_its_tables():
+    import reproduce
+    options = reproduce.arguments(['--output', str(FOLDER / 'results')])
+    found = [group for group in reproduce.GROUPS
+             if reproduce.stored(options, group)]
+    page = (FOLDER / 'results' / 'summary.rst').read_text()
+    for group in found:
+        for figure in group.figures:
+            assert figure.title in page
+    assert len(found) == len(reproduce.GROUPS)
 
 
 @pytest.mark.usefixtures('store')

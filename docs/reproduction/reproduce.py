@@ -30,6 +30,7 @@ from styles import STYLE
 
 GROUPS = (*table_figures.GROUPS, *psf_figures.GROUPS, *map_figures.GROUPS,
           *sky_figures.GROUPS, *crowded_figures.GROUPS)
+OPTICS = ('galsim', 'mixtures')
 ORDER = ('table1', 'table2', 'fig1', 'fig2', 'fig3', 'fig4', 'fig5', 'fig6',
          'fig7', 'fig8', 'fig9', 'fig10', 'fig11', 'fig12', 'fig13', 'fig14',
          'appendix_a', 'appendix_b')
@@ -60,7 +61,7 @@ def arguments(argv=None):
                         '(%(default)s)')
     parser.add_argument('--redo', action='store_true',
                         help='measure again what is there')
-    parser.add_argument('--optics', choices=('galsim', 'mixtures'),
+    parser.add_argument('--optics', choices=OPTICS,
                         default=optics(), help='how the true PSF is made '
                         '(%(default)s here)')
     parser.add_argument('--crowdsource-python', metavar='PYTHON',
@@ -132,8 +133,8 @@ def stored(options, group):
     """
     sizes = [options.size, *(name for name in SIZES if name != options.size)]
     for size in sizes:
-        for optics in ('galsim', 'mixtures'):
-            run = Run(SIZES[size], optics, options.output)
+        for kind in OPTICS:
+            run = Run(SIZES[size], kind, options.output)
             if group.stored(run):
                 others = [of_seed(run, int(path.name.partition('_')[2]))
                           for path in sorted(run.folder.glob('seed_*'))]
@@ -146,8 +147,8 @@ def draw_all(parts):
     """
     Draw the figures of the runs of each group.
 
-    Returns by key a figure and its lines for each seed, and what was left
-    out.
+    Returns by key the name of the group, a figure and its lines for each
+    seed; and what was left out.
     """
     done, skipped = {}, {}
     for group in GROUPS:
@@ -157,8 +158,8 @@ def draw_all(parts):
                 with style.context(STYLE):
                     parts[group.name][0].figure(figure.key,
                                                 figure.draw(tables[0]))
-            done[figure.key] = figure, [figure.compare(one)
-                                        for one in tables]
+            done[figure.key] = (group.name, figure, [
+                figure.compare(one) for one in tables])
         for run in parts.get(group.name, ())[:1]:
             skipped |= run.skipped
     return done, skipped

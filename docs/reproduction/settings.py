@@ -133,9 +133,9 @@ HALF = Settings(
 
 FULL = Settings(
     name='full', detectors=tuple(BANDS), shape=DETECTOR, sky_shape=DETECTOR,
-    crowded_shape=(2308, 2304), spacing=None, grid=30, degree=3, psf_stars=1500,
-    sources=(614, 590), references=100, resamplings=10000, draws=1000,
-    optics=(8, 11))
+    crowded_shape=(2308, 2304), spacing=None, grid=30, degree=3,
+    psf_stars=1500, sources=(614, 590), references=100, resamplings=10000,
+    draws=1000, optics=(8, 11))
 
 SIZES = {one.name: one for one in (QUICK, HALF, FULL)}
 

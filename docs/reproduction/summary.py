@@ -66,7 +66,7 @@ def write(folder, parts, done, order, skipped, crowdsource_python=None):
     parts : dict
         The runs of all seeds, the one that is shown first, by group.
     done : dict
-        A figure and its lines for each seed, by key.
+        Its group, a figure and its lines for each seed, by key.
     order : tuple of str
         The keys of all figures, in the order of the page.
     skipped : dict
@@ -76,12 +76,10 @@ def write(folder, parts, done, order, skipped, crowdsource_python=None):
     """
     page = [_head(parts, [key for key in order if key not in done], skipped,
                   crowdsource_python)]
-    of_figure = {figure: name for name, figures in FIGURES_OF.items()
-                 for figure in figures}
     for key in order:
         if key in done:
-            name = of_figure[key]
-            page.append(_section(folder, parts[name], name, *done[key]))
+            name, figure, lines = done[key]
+            page.append(_section(folder, parts[name], name, figure, lines))
     (folder / 'summary.rst').write_text('\n'.join(page))
 
 
@@ -125,10 +123,11 @@ def _sizes(parts):
     rows = ['.. list-table::', '   :header-rows: 1', '   :widths: 16 10 37 37',
             '']
     rows += _row(['Figures', 'Size', 'This page', 'The paper'])
-    for name, (figures, ours, paper) in SIZES_OF.items():
+    for name, (figures, paper) in PAPER.items():
         if name in parts:
             settings = parts[name][0].settings
-            rows += _row([figures, settings.name, ours(settings), paper])
+            rows += _row([figures, settings.name, _size(name, settings),
+                          paper])
     return '\n'.join(rows)
 
 
@@ -145,35 +144,34 @@ def _stars(s):
             f'bright and alone, at most {s.psf_stars}')
 
 
-# By group: its figures; its size; that of the paper.
-SIZES_OF = {
-    'psf': ('1 to 3, Appendix B', lambda s: (
-        f'{_square(s.shape)}; {_stars(s)}'), '9216 x 9232 pixels; the point '
-        'sources of 135 pointings, about 3400 a detector'),
-    'posterior': ('Appendix A', lambda s: (
-        f'the same; two chains of {s.draws} draws'), 'one PSF'),
-    'maps': ('4 to 7', lambda s: (
-        f'{len(s.detectors)} detectors of {_square(s.shape)}, {s.grid} x '
-        f'{s.grid} places on each; {_stars(s)}'),
-        '18 detectors, 30 x 30 places on each'),
-    'sky': ('8 to 12', lambda s: (
-        f'{_square(s.sky_shape)}, {s.sources[0]} stars and {s.sources[1]} '
-        f'quasars, of which {s.references} are references; {_stars(s)}; '
-        f'bootstraps of {s.resamplings}'),
-        '9216 x 9232 pixels, 614 stars and 590 quasars, 100 references; '
-        'bootstraps of 10000'),
-    'crowded': ('13 and 14', lambda s: (
-        f'{_square(s.crowded_shape)} with the density of the paper; '
-        f'{_stars(s)}'), '9216 x 9232 pixels with 5.4 million stars'),
+# By group: its figures, and what the paper has of all that a run may have
+# less of.
+PAPER = {
+    'psf': ('1 to 3, Appendix B',
+            '9216 x 9232 pixels; 3400 sources of 135 pointings'),
+    'posterior': ('Appendix A', 'one PSF'),
+    'maps': ('4 to 7', '18 such detectors, 30 x 30 places on each'),
+    'sky': ('8 to 12',
+            'such a detector; 614 stars, 590 quasars, 100 references'),
+    'crowded': ('13 and 14', '9216 x 9232 pixels with 5.4 million stars'),
 }
 
-# The figures of the groups.
-FIGURES_OF = {
-    'tables': ('table1', 'table2'),
-    'psf': ('fig1', 'fig2', 'fig3', 'appendix_b'),
-    'posterior': ('appendix_a',), 'maps': ('fig4', 'fig5', 'fig6', 'fig7'),
-    'sky': ('fig8', 'fig9', 'fig10', 'fig11', 'fig12'),
-    'crowded': ('fig13', 'fig14')}
+
+def _size(name, s):
+    """Return what a run of a size simulates for a group, in words."""
+    if name == 'psf':
+        return f'{_square(s.shape)}; {_stars(s)}'
+    if name == 'posterior':
+        return f'the same; two chains of {s.draws} draws'
+    if name == 'maps':
+        return (f'{len(s.detectors)} detectors of {_square(s.shape)}, '
+                f'{s.grid} x {s.grid} places on each; {_stars(s)}')
+    if name == 'sky':
+        return (f'{_square(s.sky_shape)}, {s.sources[0]} stars and '
+                f'{s.sources[1]} quasars, {s.references} references; '
+                f'{_stars(s)}; bootstraps of {s.resamplings}')
+    return (f'{_square(s.crowded_shape)} with the density of the paper; '
+            f'{_stars(s)}')
 
 
 def _costs(parts):
