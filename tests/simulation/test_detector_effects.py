@@ -322,6 +322,24 @@ def test_diffusion_reaches_the_photons_of_optics(optics):
                     (0.3 * 0.074)**2)
 
 
+def test_light_of_optics_is_drawn_once_for_all_exposures(optics, monkeypatch):
+    drawn, light = [], Optics.light
+    monkeypatch.setattr(Optics, 'light', lambda self, *place, **options: (
+        drawn.append(place), light(self, *place, **options))[1])
+    psf = optics.to_gridded_psf(2, radius=8)
+    effects = DetectorEffects(charge_diffusion=0.1, brighter_fatter=1.0)
+    images = [simulate(one_star(30, 30, 1e4), psf=psf, rng=1,
+                       instrument=Instrument(shape=(64, 128)),
+                       effects=effects).image for _ in range(2)]
+    assert len(drawn) == 4
+    assert_array_equal(*images)
+    # Another diffusion has another light.
+    simulate(one_star(30, 30, 1e4), psf=psf, rng=1,
+             instrument=Instrument(shape=(64, 128)),
+             effects=DetectorEffects(brighter_fatter=1.0))
+    assert len(drawn) == 8
+
+
 def test_a_table_of_unknown_optics_cannot_repel_charge():
     pytest.importorskip('galsim')
     psf = csst_psf((64, 64)).to_gridded_psf(oversampling=2)
