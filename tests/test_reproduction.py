@@ -5,7 +5,9 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable
@@ -370,6 +372,30 @@ def test_a_group_of_which_tables_are_missing_is_not_on_the_page(tmp_path):
     (tmp_path / 'tables' / f'{group.tables[-1]}.ecsv').unlink()
     options = reproduce.arguments(['--output', str(tmp_path)])
     assert reproduce.stored(options, group) == []
+
+
+@pytest.mark.usefixtures('store')
+def test_a_part_of_the_crowded_chip_does_not_reach_the_paper():
+    from dataclasses import replace
+
+    import crowded_figures
+    from settings import DETECTOR, FULL
+    names = [*crowded_figures.SEXTRACTOR, crowded_figures.PAPER,
+             crowded_figures.OURS]
+    errors = QTable({
+        'method': names, 'mag': np.full(5, 22.5) * u.mag,
+        'median_error': [5.0, 5.0, 5.0, 1.0, 1.0] * u.mas,
+        'crowded_same_stars': np.ones(5) * u.mas,
+        'completeness': np.ones(5)})
+    windows = QTable({'mag': [] * u.mag})
+
+    def judged(settings):
+        lines = crowded_figures.compare_errors({
+            'run': SimpleNamespace(settings=settings),
+            'errors': errors, 'windows': windows})
+        return lines[0].verdict
+    assert judged(FULL) == 'better, in a smaller field'
+    assert judged(replace(FULL, crowded_shape=DETECTOR)) == 'reached'
 
 
 @pytest.mark.usefixtures('store')

@@ -25,7 +25,7 @@ from scenes import (
 )
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
-from settings import PIXEL, effects
+from settings import DETECTOR, PIXEL, effects
 from store import Comparison, Figure, Group, binned, judged, plain
 from styles import COLOURS, canvas_of, plain_log
 
@@ -478,7 +478,8 @@ def compare_errors(tables):
         return [Comparison('error over that of the best mode of SExtractor',
                            'below 1 for stars fainter than 21 mag',
                            'SExtractor is not installed')]
-    full, lines = tables['run'].settings.name == 'full', []
+    # A full run has a part of the chip, which is not the paper's size.
+    full, lines = tables['run'].settings.crowded_shape == DETECTOR, []
     for middle in np.unique(table['mag'].value):
         here = table[table['mag'].value == middle]
         some = here[np.isin(here['method'], modes)

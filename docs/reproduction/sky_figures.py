@@ -2,7 +2,7 @@
 from dataclasses import replace
 
 import numpy as np
-from settings import CAMPAIGNS, PIXEL
+from settings import CAMPAIGNS, DETECTOR, PIXEL
 from sky_measures import (
     COORDINATES,
     MODELS,
@@ -102,7 +102,8 @@ def _scatter_error(part):
 
 def compare_positions(coordinate, tables):
     """Compare the smallest error of the bins that are not tiny."""
-    table, full = tables['positions'], tables['run'].settings.name == 'full'
+    table = tables['positions']
+    full = tables['run'].settings.sky_shape == DETECTOR
     lines = []
     for model, words in MODELS.items():
         part = table[(table['model'] == model)
@@ -173,7 +174,8 @@ def dates_alone(which):
 
 def compare_medians(tables):
     """Compare the medians for two, five and seven observations."""
-    table, full = tables['medians'], tables['run'].settings.name == 'full'
+    table = tables['medians']
+    full = tables['run'].settings.sky_shape == DETECTOR
     words = ', '.join(f'{dates_alone(CAMPAIGNS[n]):.3f}' for n in (2, 5, 7))
     lines = [Comparison(
         '2, 5 and 7 observations that are good to 1 mas, from the dates of '
