@@ -78,10 +78,12 @@ class Catalogues:
     run: object
 
     def __getitem__(self, key):
-        number, name = key
-        return self.run.table(
+        number, wanted = key
+        # With all models while the exposure is in memory.
+        return {name: self.run.table(
             f'epoch_{number}_{name}',
-            lambda: _observe(self.run, number, name), keep=False)
+            lambda name=name: _observe(self.run, number, name),
+            keep=False) for name in MODELS}[wanted]
 
 
 # Positions
