@@ -8,10 +8,9 @@ import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
 
+from photutils_mgauss.sky.gnomonic import STEP, Gnomonic
 from photutils_mgauss.sky.tangent_plane import local_axes, unit_vectors
 from photutils_mgauss.utils.validation import as_integer, as_real
-
-STEP = 0.5  # pixels either side of a star for derivatives of a WCS
 
 
 def check_celestial(wcs, name='wcs'):
@@ -53,6 +52,9 @@ def pixel_to_vectors(wcs, x, y, *, bounded=True):
     With ``bounded=False`` a gwcs is continued beyond its bounding box.
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    gnomonic = _gnomonic(wcs, x, y)
+    if gnomonic is not None:
+        return gnomonic.vectors(x, y)
     first, second = _world_values(wcs, x, y, bounded)
     values = [np.asarray(first, dtype=float) * u.Unit(
         wcs.world_axis_units[0]), np.asarray(second, dtype=float) * u.Unit(
@@ -67,12 +69,24 @@ def pixel_to_vectors(wcs, x, y, *, bounded=True):
     return np.asarray(sky.cartesian.xyz.value)
 
 
+def _gnomonic(wcs, x, y):
+    """Return the `Gnomonic` map of an ICRS WCS, None if it is none such."""
+    found = Gnomonic.of(wcs, x, y)
+    if found is not None and celestial_frame(wcs).name == 'icrs':
+        return found
+    return None
+
+
 def pixel_jacobian(wcs, plane, x, y, turn=None):
     """
     Return d(plane)/d(pixel), shape (2, 2, n) [mas/pix].
 
     ``turn`` (3, 3) is a rotation of the sphere between the two, if any.
     """
+    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    gnomonic = _gnomonic(wcs, x, y)
+    if gnomonic is not None:
+        return gnomonic.jacobian(plane, x, y, turn)
     columns = []
     for dx, dy in ((STEP, 0), (0, STEP)):
         after, before = (
