@@ -74,6 +74,14 @@ class EliminatedStars:
 
 def eliminate(problem):
     """Return the `EliminatedStars` of a problem."""
+    columns, weighted, factor, y, solved = _alone(problem)
+    basis = problem.transform.basis(problem.origin)
+    return EliminatedStars(columns, factor, y, _combine(factor, weighted),
+                           basis, solved)
+
+
+def _alone(problem):
+    """Return D, W D, R, y, and which stars are solved."""
     columns = problem.columns()
     weighted = [_weigh(problem.weights, column) for column in columns]
     normal = _normal_matrices(columns, weighted, problem)
@@ -81,9 +89,7 @@ def eliminate(problem):
                        + _sum(y, problem.offsets[1]) for x, y in weighted])
     _add_priors(problem.priors, normal, moment)
     factor, solved = inverse_factor(normal)
-    basis = problem.transform.basis(problem.origin)
-    return EliminatedStars(columns, factor, apply(factor, moment),
-                 _combine(factor, weighted), basis, solved)
+    return columns, weighted, factor, apply(factor, moment), solved
 
 
 def _weigh(weights, column):
@@ -177,6 +183,21 @@ def reduce_stars(problem):
     return Reduced(matrix, rhs, direct)
 
 
+def reduced_rhs(problem):
+    r"""
+    Return the right hand side of the `Reduced` equations alone.
+
+    It is :math:`-A^T W (z - D v)` with the v of a star in the frames as they
+    are.
+    """
+    if not problem.ties.all():
+        problem = problem.select(np.flatnonzero(problem.ties))
+    columns, _, factor, y, solved = _alone(problem)
+    away = _residuals(problem.offsets, columns, apply_transposed(factor, y))
+    return -_direct_rhs(problem.weights * solved, away,
+                        problem.transform.basis(problem.origin)).ravel()
+
+
 def _direct(weights, basis):
     """Return the diagonal blocks A^T W A, shape (E, 2b, 2b)."""
     xx, xy, yy = ([(basis * row) @ basis.T for row in element]
@@ -204,8 +225,16 @@ def each_part(function, problem, executor=None):
     return map_parallel(function, parts(problem), executor=executor)
 
 
-def reduce_all(problem, executor=None):
-    """Return the `Reduced` equations of a whole problem."""
+def reduce_all(problem, executor=None, *, like=None):
+    """
+    Return the `Reduced` equations of a whole problem.
+
+    ``like`` are those of a problem that differs in its offsets alone: but
+    for the right hand side they are the same.
+    """
+    if like is not None:
+        return replace(like, rhs=sum(each_part(reduced_rhs, problem,
+                                               executor)))
     return reduce(add, each_part(reduce_stars, problem, executor))
 
 
@@ -251,7 +280,7 @@ def solve_stars(problem, correction, inverse, *, residuals=False,
     away = predicted = None
     judged = None, None, None
     if residuals or judge:
-        away = _residuals(problem.offsets + shift, stars, values)
+        away = _residuals(problem.offsets + shift, stars.columns, values)
     if leverage or judge:
         predicted = _predicted(stars, problem, inverse, framed, middle)
     if judge:
@@ -263,10 +292,11 @@ def solve_stars(problem, correction, inverse, *, residuals=False,
     return replace(found, total=total_chi2(problem, found))
 
 
-def _residuals(offsets, stars, values):
+def _residuals(offsets, columns, values):
+    """Return z - D v, (2, E, n)."""
     return offsets - np.stack([
         sum(_times(column[c], value) for column, value in zip(
-            stars.columns, values, strict=True)) for c in range(2)])
+            columns, values, strict=True)) for c in range(2)])
 
 
 def _judge(residuals, predicted, weights):

@@ -139,20 +139,23 @@ def _reference_rms(setup, state, residuals):
         if own.any() else [np.nan, np.nan] for e, own in enumerate(used)])
 
 
-def pose(setup, state):
-    """Return the `MotionProblem` of the present maps, masks and floors."""
+def pose(setup, state, weights=None):
+    """
+    Return the `MotionProblem` of the present maps, masks and floors.
+
+    ``weights`` are those of before, where only maps have changed.
+    """
     sightings, transform = setup.sightings, setup.transform
     ties = _ties(setup, state)
     priors = setup.priors.without(state.dropped).with_others(
         setup.places.of(state.dropped))
     offsets = np.empty_like(sightings.places)
-    weights = np.empty_like(sightings.covariance)
+    if weights is None:
+        weights = _weights(setup, state)
     places = setup.undistorted(state)
     for e, coefficients in enumerate(state.maps):
         aligned = transform.apply(coefficients, places[:, e])
         offsets[:, e] = aligned - setup.origin
-        covariance = measured(setup, state, e)
-        weights[:, e] = np.where(state.used[e], invert_2x2(*covariance), 0.0)
     if setup.drift is not None:
         stars, parallactic = setup.drift
         offsets[..., stars] -= parallactic
@@ -164,6 +167,15 @@ def pose(setup, state):
         sightings.observer if setup.options.parallax else None,
         sightings.plane, transform, priors, setup.options.acceleration,
         ties)
+
+
+def _weights(setup, state):
+    """Return the inverse covariances of the detections, 0 where unused."""
+    out = np.empty_like(setup.sightings.covariance)
+    for e, used in enumerate(state.used):
+        out[:, e] = np.where(used, invert_2x2(*measured(setup, state, e)),
+                             0.0)
+    return out
 
 
 def measured(setup, state, e):
@@ -185,17 +197,23 @@ def _ties(setup, state):
     return ties
 
 
-def _step(setup, state):
-    """Solve for the frames once; return problem, frames and new maps."""
-    problem, back = pose(setup, state), None
+def _step(setup, state, weights=None, like=None):
+    """
+    Solve for the frames once; return problem, frames and new maps.
+
+    And the equations of the frames, which with the ``weights`` serve the
+    next step, ``like`` these: only offsets change with the maps.
+    """
+    problem, back, reduced = pose(setup, state, weights), None, None
     if setup.transform.n_parameters == 0:
         frames = fixed_frames(problem)
     else:
-        reduced = reduce_all(problem, setup.options.executor)
+        reduced = found = reduce_all(problem, setup.options.executor,
+                                     like=like)
         if setup.distortion is not None:
-            reduced, back = without_chips(reduced, reduce_chips(
+            found, back = without_chips(reduced, reduce_chips(
                 problem, setup.distortion, state.distortion))
-        frames = solve_frames(problem, reduced, relative=setup.relative)
+        frames = solve_frames(problem, found, relative=setup.relative)
     if back is not None:
         change = back(frames.correction).reshape(state.distortion.shape)
         state = replace(state, distortion=state.distortion + change)
@@ -205,15 +223,18 @@ def _step(setup, state):
     if len(setup.nearing.stars):
         found = solve(setup, problem.select(setup.nearing.stars), frames)
         swerve = swerved(setup, swerve, found.values)
-    return problem, frames, replace(state, maps=maps, swerve=swerve)
+    return problem, frames, replace(state, maps=maps, swerve=swerve), reduced
 
 
 def _align(setup, state):
     """Iterate until the maps stand still."""
     before, typical = np.inf, np.sqrt(setup.sightings.typical_variance)
+    weights = reduced = None
     for i in range(MAX_ITERATIONS):
         problem = frames = None  # as large as all that was measured
-        problem, frames, after = _step(setup, state)
+        problem, frames, after, reduced = _step(setup, state, weights,
+                                                reduced)
+        weights = problem.weights
         # In units of a typical error.
         size = np.abs(frames.correction).sum(axis=2).max(initial=0) / typical
         turned = np.abs(after.swerve - state.swerve).max(initial=0) / typical
