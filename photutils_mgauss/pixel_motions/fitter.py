@@ -259,10 +259,9 @@ class PixelMotionFitter:
 
     def _solve(self, campaign, listed, frames=None):
         """Return the solution of the stars listed."""
-        start = campaign.views(listed.values[:, None]).pixels
         solved = self._stars(listed, campaign, self.reach)
         errors = self._errors(campaign, solved, frames)
-        table = star_table(campaign, listed, solved, errors, start[:, :, 0],
+        table = star_table(campaign, listed, solved, errors,
                            forced=self.forced, relative=self._is_relative())
         images = image_table(campaign, solved, errors)
         notes = campaign.notes + _coverage(campaign, solved)

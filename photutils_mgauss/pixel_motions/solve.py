@@ -79,6 +79,8 @@ class Solved:
     groups, states : list
         The stars (g, m) of groups of each size, and their
         `~photutils_mgauss.photometry.joint_pixels.State`.
+    given : (n, E, 2) `~numpy.ndarray`
+        Where stars of the values given would be seen.
     """
 
     values: np.ndarray
@@ -98,6 +100,7 @@ class Solved:
     spread: np.ndarray
     groups: list
     states: list
+    given: np.ndarray
 
 
 def solve(campaign, values, fit_shape, *, reach, forced, executor,
@@ -109,19 +112,22 @@ def solve(campaign, values, fit_shape, *, reach, forced, executor,
     all at the peaks of their likelihood. Stars whose place is not finite, or
     that no image shows, are left out of the fit and get no pixels.
     """
-    pixels = campaign.views(values[:, None]).pixels[:, :, 0]
+    views = campaign.views(values[:, None])
+    pixels = views.pixels[:, :, 0]
     groups = _groups(campaign, pixels)
     near = _has_neighbours(pixels, campaign, fit_shape)
     fit_all = partial(_fit_all, groups=groups, fit_shape=fit_shape,
-                      forced=forced, spread_over=partial(
+                      forced=forced, given=pixels, spread_over=partial(
                           _spread_over, executor, progress_bar))
     region = (None if forced or reach is None else
               _Region.of(campaign, values, reach))
     if not near:
-        return fit_all(campaign, values, own=None, region=region)
+        return fit_all(campaign, values, views=views, own=None,
+                       region=region)
     own, moved = None, np.inf
     for _ in range(_ROUNDS):
-        state = fit_all(campaign, values, own=own)
+        state = fit_all(campaign, values, views=views, own=own)
+        views = None
         moved = _moved(state, values)
         values = state.values
         if own is not None and moved < _SETTLED:
@@ -209,12 +215,17 @@ def _has_neighbours(pixels, campaign, fit_shape):
     return False
 
 
-def _fit_all(campaign, values, *, groups, fit_shape, forced, own, spread_over,
-             region=None):
-    """Fit all groups once, the WCS taken anew where stars have moved."""
+def _fit_all(campaign, values, *, groups, fit_shape, forced, given, own,
+             spread_over, views=None, region=None):
+    """
+    Fit all groups once, the WCS taken anew where stars have moved.
+
+    ``views`` are those of all stars, one by one, if they are at hand.
+    """
     parts = []
+    every = campaign.views(values[:, None]) if views is None else views
     for group in groups:
-        views = campaign.views(values[group])
+        views = _joined_views(every, group)
         moving = np.arange(len(group))
         done = None
         for _ in range(3):
@@ -230,7 +241,14 @@ def _fit_all(campaign, values, *, groups, fit_shape, forced, own, spread_over,
             moving = moving[at]
             views = campaign.views(got.state.values[at])
         parts.append((group, done))
-    return _collect(campaign, values, parts)
+    return _collect(campaign, values, parts, given)
+
+
+def _joined_views(every, group):
+    """Return the views of groups (g, m) from those of single stars."""
+    pixels, slopes = (np.swapaxes(one[:, :, 0][group], 1, 2)
+                      for one in (every.pixels, every.slopes))
+    return Views(every.values[:, 0][group], pixels, slopes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,7 +357,7 @@ def _replaced(part, rows, other):
     return _Part(*out)
 
 
-def _collect(campaign, values, parts):
+def _collect(campaign, values, parts, given):
     """Return the `Solved` of all stars, from groups of all sizes."""
     n, n_images, p = len(values), campaign.n_images, values.shape[1]
     shared = campaign.joint.shared
@@ -351,7 +369,8 @@ def _collect(campaign, values, parts):
         np.zeros((n, n_images)), np.zeros((n, n_images, 2, 2)),
         np.zeros((n, n_images, 2)), np.zeros((n, n_images)),
         np.zeros((n, n_images)), np.full((n, p, p), np.nan),
-        [group for group, _ in parts], [part.state for _, part in parts])
+        [group for group, _ in parts], [part.state for _, part in parts],
+        given)
     for group, part in parts:
         state = part.state
         for c in range(group.shape[1]):

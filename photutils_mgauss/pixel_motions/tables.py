@@ -17,7 +17,7 @@ NOT_CONVERGED, POSITION_ONLY, WANDERED = 65536, 131072, 262144
 _SHIFT, _SURE, _FEW, _BRIGHT = 0.05, 6.0, 5, 5.0
 
 
-def star_table(campaign, listed, solved, errors, start, *, forced, relative):
+def star_table(campaign, listed, solved, errors, *, forced, relative):
     """Return the table of n stars."""
     seen = solved.weights > 0
     solved_for = _solved_for(errors, solved, forced)
@@ -32,7 +32,8 @@ def star_table(campaign, listed, solved, errors, start, *, forced, relative):
     table['n_images'] = seen.sum(axis=1)
     table['significance'] = significance(solved)
     table['reference'] = words_column(np.full(len(table), '', 'U8'))
-    moved = np.abs(np.where(seen[..., None], solved.pixels - start, 0))
+    moved = np.abs(np.where(seen[..., None], solved.pixels - solved.given,
+                            0))
     far = np.nan_to_num(moved).max(axis=(1, 2), initial=0)
     away = far > np.median(_box_sides(solved, seen)) / 2
     table['flags'] = (

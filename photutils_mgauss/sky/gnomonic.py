@@ -45,16 +45,44 @@ class Gnomonic:
 
         The WCS itself is asked at some of them.
         """
+        found = cls._thought(wcs)
+        return found if found and found._holds(wcs, x, y) else None
+
+    @classmethod
+    def inverted(cls, wcs, vectors):
+        """
+        Return the pixels x and y (n,) of unit vectors (3, n), NaN behind.
+
+        None for a WCS that is none such or has distortions.
+        """
+        found = cls._thought(wcs)
+        if found is None or found.wcs is not None:
+            return None
+        x, y, depth = np.tensordot(np.linalg.inv(found.matrix), vectors,
+                                   axes=1)
+        depth = np.where(depth > 0, depth, np.nan)
+        x, y = x / depth, y / depth
+        return (x, y) if found._holds(wcs, x, y) else None
+
+    @classmethod
+    def _thought(cls, wcs):
+        """Return the map that the keywords of an ICRS WCS speak of."""
         if type(wcs) is not WCS or list(wcs.wcs.ctype) not in CTYPES or (
                 wcs.pixel_bounds is not None or wcs.wcs.get_pv()):
             return None
-        found = cls(_matrix(wcs), wcs if wcs.has_distortion else None)
+        if wcs.wcs.radesys != 'ICRS' and (
+                wcs.wcs.radesys or np.isfinite(wcs.wcs.equinox)):
+            return None
+        return cls(_matrix(wcs), wcs if wcs.has_distortion else None)
+
+    def _holds(self, wcs, x, y):
+        """Return whether a WCS says the same of some pixels."""
         x, y = np.ravel(x), np.ravel(y)
         some = np.flatnonzero(np.isfinite(x + y))
         some = some[::max(1, len(some) // SAMPLE)]
         asked = unit_vectors(*wcs.all_pix2world(x[some], y[some], 0))
-        away = np.abs(found.vectors(x[some], y[some]) - asked)
-        return found if (away < AGREE).all() else None
+        away = np.abs(self.vectors(x[some], y[some]) - asked)
+        return bool((away < AGREE).all())
 
     def vectors(self, x, y):
         """Return the unit vectors (3, n) of pixels."""
@@ -70,8 +98,8 @@ class Gnomonic:
         length = np.sqrt(depth * depth + place[0]**2 + place[1]**2)
         depth[~(depth > NEAREST * length)] = np.nan
         out = np.empty((2, 2, *np.shape(x)))
-        for row, along, slope in zip(out, place, matrix[1:], strict=True):
-            along /= depth
+        for row, side, slope in zip(out, place, matrix[1:], strict=True):
+            along = side / depth
             for k in (0, 1):
                 row[k] = (slope[k] - matrix[0, k] * along) * (MAS / depth)
         if self.wcs is None:

@@ -52,7 +52,7 @@ def pixel_to_vectors(wcs, x, y, *, bounded=True):
     With ``bounded=False`` a gwcs is continued beyond its bounding box.
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    gnomonic = _gnomonic(wcs, x, y)
+    gnomonic = Gnomonic.of(wcs, x, y)
     if gnomonic is not None:
         return gnomonic.vectors(x, y)
     first, second = _world_values(wcs, x, y, bounded)
@@ -69,14 +69,6 @@ def pixel_to_vectors(wcs, x, y, *, bounded=True):
     return np.asarray(sky.cartesian.xyz.value)
 
 
-def _gnomonic(wcs, x, y):
-    """Return the `Gnomonic` map of an ICRS WCS, None if it is none such."""
-    found = Gnomonic.of(wcs, x, y)
-    if found is not None and celestial_frame(wcs).name == 'icrs':
-        return found
-    return None
-
-
 def pixel_jacobian(wcs, plane, x, y, turn=None):
     """
     Return d(plane)/d(pixel), shape (2, 2, n) [mas/pix].
@@ -84,7 +76,7 @@ def pixel_jacobian(wcs, plane, x, y, turn=None):
     ``turn`` (3, 3) is a rotation of the sphere between the two, if any.
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    gnomonic = _gnomonic(wcs, x, y)
+    gnomonic = Gnomonic.of(wcs, x, y)
     if gnomonic is not None:
         return gnomonic.jacobian(plane, x, y, turn)
     columns = []
@@ -104,8 +96,9 @@ def invert_wcs(wcs, coordinates, *, start=None, tolerance=1e-7,
     r"""
     Return the pixels of sky positions, using only the forward map.
 
-    Newton's method on the residuals of unit vectors along local east and
-    north, which works at the poles and at any rotation, where the numerical
+    Linear algebra for a gnomonic WCS without distortions. Else Newton's
+    method on the residuals of unit vectors along local east and north, which
+    works at the poles and at any rotation, where the numerical
     inverse of a gwcs without an analytic one fails or returns wrong pixels.
 
     Parameters
@@ -156,6 +149,9 @@ def invert_wcs(wcs, coordinates, *, start=None, tolerance=1e-7,
     target = np.asarray(coordinates.icrs.cartesian.xyz.value)
     shape = target.shape[1:]
     target = target.reshape(3, -1)
+    pixels = Gnomonic.inverted(wcs, target)
+    if pixels is not None:
+        return tuple(axis.reshape(shape) for axis in pixels)
     x, y = _start(wcs, start, target.shape[1])
     east, north = local_axes(target)
     step = np.full(target.shape[1], np.inf)

@@ -39,7 +39,7 @@ def with_pole(wcs):
 def pixels(rng):
     """Places all over a chip of 9000 pixels, one of them unknown."""
     x, y = rng.uniform(0, 9000, (2, 200))
-    x[7] = np.nan
+    x[7] = y[7] = np.nan
     return x, y
 
 
@@ -76,6 +76,18 @@ def test_derivatives_are_differences_of_places(wcs, turned, pixels):
     assert np.isnan(got[..., 7]).all()
     # Places of 1e6 mas round to 1e-9 parts of a pixel.
     assert_allclose(got, expected, rtol=0, atol=1e-8 * np.nanmax(expected))
+
+
+@pytest.mark.parametrize('wcs', WCSS)
+def test_the_inverse_is_exact_or_left_to_newton(wcs, pixels):
+    vectors = pixel_to_vectors(wcs, *pixels)
+    found = Gnomonic.inverted(wcs, np.column_stack([vectors, -vectors[:, 0]]))
+    if wcs.has_distortion:
+        assert found is None
+        return
+    x, y = found
+    assert np.isnan([x[-1], y[-1]]).all()
+    assert_allclose([x[:-1], y[:-1]], pixels, rtol=0, atol=1e-8)
 
 
 def test_places_behind_the_horizon_of_a_plane_are_nan():
