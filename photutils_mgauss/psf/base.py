@@ -187,6 +187,9 @@ class PSFModel(Fittable2DModel):
         # What is shared is never changed in place, so it stays shared.
         new = self.copy()
         memo[id(self)] = new
+        # A compound model has the same Parameters as its parts.
+        memo.update((id(getattr(self, name)), getattr(new, name))
+                    for name in self.param_names)
         if '_meta' in new.__dict__:
             new.__dict__['_meta'] = copy.deepcopy(self.meta, memo)
         return new

@@ -10,6 +10,7 @@ from astropy.modeling.fitting import (
     LevMarLSQFitter,
     TRFLSQFitter,
 )
+from astropy.modeling.models import Const2D
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -353,6 +354,25 @@ def test_ties_are_part_of_the_derivatives(mixture):
         start.copy(), X, Y, data, maxiter=1000, estimate_jacobian=numerical)(
             X, Y) - data)**2) for numerical in (False, True)]
     assert squares[0] < 1.01 * squares[1]
+
+
+@pytest.mark.parametrize('fitter', [TRFLSQFitter, LevMarLSQFitter])
+def test_a_fitted_sum_draws_what_was_fitted(mixture, fitter):
+    star = MultiGaussianPSFModel(mixture, flux=5000, x_0=11, y_0=10)
+    data = star(X, Y) + 3
+    star.flux, star.x_0 = 4500, 11.2
+    scene = star + Const2D(2)
+    scene.y_0_0.tied = lambda scene: scene.x_0_0 - 1
+    fitted = fitter()(scene, X, Y, data, maxiter=1000)
+    assert_allclose(fitted(X, Y), data, atol=1e-3)
+    assert fitted.left.flux == fitted.flux_0
+    # A copy has Parameters of its own, the same for the sum and its parts.
+    again = fitted.copy()
+    again.flux_0 = 1
+    assert again.left.flux.value == 1
+    assert fitted.left.flux.value > 4900
+
+
 def test_the_one_that_photutils_puts_into_all_parameters_is_taken():
     model = MultiGaussianPSFModel()
     for name in model.param_names:
