@@ -77,7 +77,7 @@ class CrowdedMixturePhotometry:
         checkpoint: str | PathLike[str] | None = None, psf_errors: bool = True,
         confusion: bool = True, correlated_noise: bool = True,
         saturation: float | Quantity | None = None,
-        residual_radius: float | None = None,
+        residual_radius: float | None = None, **elsewhere: Any,
     ) -> None: ...
     def __call__(
         self, data: ArrayLike | NDData, *, mask: ArrayLike | None = None,

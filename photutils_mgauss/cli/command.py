@@ -52,10 +52,23 @@ def main(argv=None):
     words = sys.argv[1:] if argv is None else list(argv)
     if not words:
         parser.exit(2, parser.format_help())
+    _check_command(parser, words[0])
     options, unknown = parser.parse_known_args(words)
     if unknown:
         options.parser.error(_unknown(options.parser, unknown))
     return run_command(options, words, is_process=argv is None)
+
+
+def _check_command(parser, word):
+    """End with a sentence if the first word is no command."""
+    names = [module.__name__.rpartition('.')[2].removesuffix('_command')
+             for module in _COMMANDS]
+    if word.startswith('-') or word in names:
+        return
+    near = get_close_matches(word, names, 1)
+    meant = f' (did you mean {near[0]}?)' if near else ''
+    parser.error(f'unknown command: {word}{meant}; there are '
+                 f'{", ".join(names)}')
 
 
 def _unknown(parser, words):

@@ -8,6 +8,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from photutils_mgauss.cli import tools
+from photutils_mgauss.utils.parallel import watched
 from photutils_mgauss.utils.waiting import waiting
 
 _EXAMPLE = """\
@@ -45,6 +46,9 @@ _NAMED = 6
 # What an exposure takes with the defaults [CPU s], and what each of its pixels
 # adds, of two sizes with 180 and 717 stars.
 _EACH, _EACH_PIXEL = 11.1, 7e-6
+_MOTIONS_TAKE = ('they take two measured exposures of a field, or one and '
+                 'references of [motions], which have positions of another '
+                 'time')
 # Keywords of so many images are looked at for an example.
 _LOOKED_AT = 50
 
@@ -152,13 +156,27 @@ def _plan(survey, kept):
     lines = [total, f'{len(kept)} exposures have results of an earlier run',
              _cost(survey, kept)]
     for name, members in survey.fields.items():
-        years = [survey.exposures[i].year for i in members]
         names = [survey.exposures[i].name for i in members]
         more = ', ...' if len(names) > _NAMED else ''
-        lines.append(f'  {name}: {len(members)} exposures, {min(years):.2f} '
-                     f'to {max(years):.2f}: {", ".join(names[:_NAMED])}'
-                     f'{more}')
+        lines.append(f'  {name}: {_exposures(survey, members)}: '
+                     f'{", ".join(names[:_NAMED])}{more}')
+    if not any(_enough(survey, members) for members in survey.fields.values()):
+        lines.append(f'no field will have motions: {_MOTIONS_TAKE}')
     return lines
+
+
+def _exposures(survey, members):
+    """Return how many exposures a field has, and of what time."""
+    years = [survey.exposures[i].year for i in members]
+    n = '1 exposure' if len(members) == 1 else f'{len(members)} exposures'
+    few = '' if _enough(survey, members) else ', too few for motions'
+    to = f' to {max(years):.2f}' if len(members) > 1 else ''
+    return f'{n}{few}, {min(years):.2f}{to}'
+
+
+def _enough(survey, members):
+    from photutils_mgauss.cli.survey_tasks import fewest_exposures
+    return len(members) >= fewest_exposures(survey)
 
 
 def _cost(survey, kept):
@@ -230,8 +248,9 @@ def _do(options, tasks, workers, what):
     if not tasks:
         return {}
     hidden = options.quiet or not sys.stderr.isatty()
-    # Within a task nothing is shown beside the bar.
-    with waiting(what, progress_bar=True), tqdm(
+    # Within a task nothing is shown beside the bar, whose clock goes on.
+    quiet = watched(lambda _done, _total: None)
+    with quiet if hidden else waiting(what, progress_bar=True), tqdm(
             total=len(tasks), desc=what, disable=hidden) as bar:
         def tell(outcome):
             bar.update()
@@ -283,7 +302,8 @@ def _dataset(survey, fields, pixels):
         tables[name] = (motions_of(survey, name, what),
                         outcomes[task].figures.get('pixels'))
     if not tables:
-        return 'no field has motions'
+        why = 'all attempts failed' if fields else _MOTIONS_TAKE
+        return f'no field has motions: {why}'
     folder = survey.output / 'motions_hats'
     try:
         n = write_dataset(folder, tables, 'motions', survey.references)

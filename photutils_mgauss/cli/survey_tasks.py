@@ -106,6 +106,11 @@ def motions_of(survey, name, what='motions'):
     return survey.output / what / name / 'motions.ecsv'
 
 
+def fewest_exposures(survey):
+    """Return how many exposures of a field motions take."""
+    return 1 if '--references' in survey.options['motions'] else 2
+
+
 def field_tasks(survey, measured):
     """
     Return the task of each field that has something to fit.
@@ -121,9 +126,9 @@ def field_tasks(survey, measured):
     -------
     list of Task
     """
-    least = 1 if '--references' in survey.options['motions'] else 2
     tasks = []
-    for name, members in _with_enough(survey, measured, least):
+    for name, members in _with_enough(survey, measured,
+                                      fewest_exposures(survey)):
         files = tuple(str(catalogue_of(survey, one)) for one in members)
         table = motions_of(survey, name)
         words = ('motions', *files, *_TO, str(table.parent),

@@ -9,7 +9,11 @@ from astropy.utils.exceptions import AstropyUserWarning
 from photutils_mgauss.crowded.correlated import allow_in_each
 from photutils_mgauss.crowded.many_equations import FARTHEST, reach_of
 from photutils_mgauss.crowded.many_plan import ManyPlan
-from photutils_mgauss.crowded.many_table import as_qtable, no_stars
+from photutils_mgauss.crowded.many_table import (
+    as_qtable,
+    no_motion,
+    no_stars,
+)
 from photutils_mgauss.crowded.plan import run
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.crowded.table import NO_COVARIANCE, NO_OVERLAP
@@ -22,6 +26,7 @@ from photutils_mgauss.photometry.many_images import (
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.utils.checkpoint import Checkpoint
 from photutils_mgauss.utils.correlated_noise import correlation_of, no_pairs
+from photutils_mgauss.utils.flags import MOTIONLESS
 
 
 class Settings(NamedTuple):
@@ -156,4 +161,5 @@ def _in_given_order(stars, given):
     missing = np.ones(len(given), bool)
     missing[stars.number] = False
     columns['flags'][missing] |= NO_COVARIANCE | NO_OVERLAP
+    columns['flags'][missing & no_motion(columns['place'])] |= MOTIONLESS
     return Stars.of_columns(columns)

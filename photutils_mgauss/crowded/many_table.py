@@ -23,6 +23,7 @@ from photutils_mgauss.crowded.table import (
 )
 from photutils_mgauss.utils.flags import (
     BLENDED,
+    MOTIONLESS,
     NOT_A_STAR,
     NOT_SEEN,
     SATURATED,
@@ -120,6 +121,11 @@ def _invertible(matrices):
     return values[:, 0] > rounding * values[:, -1]
 
 
+def no_motion(place):
+    """Whether covariances (n, p, p) lack a motion that was asked for, (n,)."""
+    return (place.shape[1] > 2) & ~np.isfinite(place[:, -1, -1])
+
+
 def _hidden(tile, variance):
     """Return what stars that were not found do in each image."""
     options = tile.options
@@ -197,6 +203,7 @@ def _flags(tile, quality, place, strength, correlation):
             (AT_BOUND, gone > s.bound - 1e-6),
             (NOT_SEEN, s.listed & ~(strength > tile.options.keep)),
             (NO_COVARIANCE, ~np.isfinite(place[:, 0, 0])),
+            (MOTIONLESS, no_motion(place)),
             (SATURATED, (lost | ~shown).all(axis=0)),
             # One image cannot tell of a star that is faint there.
             (NOT_A_STAR, smooth_light(tile.models)

@@ -38,6 +38,26 @@ _FAINTEST = 1e-3
 _LITTLE = 1.1
 
 
+# What replaces keywords of photutils' classes.
+_INSTEAD = {
+    'finder': 'it finds the stars itself, from "threshold" standard errors; '
+              'a list of your own is "init_params" of the call, with '
+              '"find_neighbors=False" where it has all stars',
+    'grouper': 'all stars are fitted together; leave it out',
+    'fit_shape': 'all pixels are fitted; leave it out',
+    'aperture_radius': 'no first fluxes are needed; leave it out',
+    'fitter': 'it has a fitter of its own; leave it out',
+    **dict.fromkeys(('local_bkg_estimator', 'localbkg_estimator'),
+                    'the background is fitted: see "background_size"'),
+}
+
+
+def _instead_of(name):
+    """Return a sentence on a keyword that does not exist."""
+    return (f'CrowdedMixturePhotometry has no keyword {name!r}'
+            + (f': {_INSTEAD[name]}' if name in _INSTEAD else ''))
+
+
 class CrowdedMixturePhotometry:
     r"""
     PSF photometry of crowded fields.
@@ -136,6 +156,8 @@ class CrowdedMixturePhotometry:
     xy_bounds : float or None, optional
         How far, along each axis, a star of a given list may be from its
         place [pix].
+    **elsewhere
+        Of keywords that only photutils has an error says what replaces them.
 
     Attributes
     ----------
@@ -172,7 +194,8 @@ class CrowdedMixturePhotometry:
     a star: part of something extended, or something else is under it. Of a
     given list, also: 524288, no significant star is here, its flux has fewer
     than ``keep`` standard errors; 1048576, a repeat: another entry means the
-    same star, whose row this one shows again.
+    same star, whose row this one shows again. With motions, also: 2097152,
+    the images that show the star do not tell its motion, which is NaN.
 
     Examples
     --------
@@ -208,7 +231,9 @@ class CrowdedMixturePhotometry:
                  overlap=128, executor=None, progress_bar=False,
                  find_neighbors=True, xy_bounds=1.0, checkpoint=None,
                  psf_errors=True, confusion=True, correlated_noise=True,
-                 saturation=None, residual_radius=None):
+                 saturation=None, residual_radius=None, **elsewhere):
+        if elsewhere:
+            raise TypeError(_instead_of(next(iter(elsewhere))))
         self.psf_model = psf_model
         self.threshold = as_real(threshold, 'threshold', above=0)
         self.keep = as_real(keep, 'keep', minimum=0)

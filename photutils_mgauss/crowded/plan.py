@@ -14,6 +14,7 @@ from photutils_mgauss.utils.checkpoint import Checkpoint, digest_of
 from photutils_mgauss.utils.correlated_noise import no_pairs
 from photutils_mgauss.utils.image import PixelData
 from photutils_mgauss.utils.parallel import Threads, tell
+from photutils_mgauss.utils.waiting import progress
 
 # The smallest and the largest size of tiles if none is given [pix].
 _TILES = (1024, 2048)
@@ -222,30 +223,24 @@ def _collect(pool, work, tasks, progress_bar, keep=None):
         except RuntimeError as error:  # the pool has broken
             errors.append(error)
         outcomes.append(None)
-    bar = _bar(len(outcomes)) if progress_bar else None
-    for future in as_completed(futures):
-        # A cluster would do again what a worker that dies has done for a
-        # future that somebody still holds.
-        number = futures.pop(future)
-        try:
-            outcomes[number] = future.result()
-        except Exception as error:  # noqa: BLE001 a worker may die of any
-            errors.append(error)
-        else:
-            if keep is not None:
-                keep(number, outcomes[number])
-        del future
-        tell(len(outcomes) - len(futures), len(outcomes))
-        if bar is not None:
-            _advance(bar, outcomes)
-    if bar is not None:
-        bar.close()
+    with progress(total=len(outcomes), desc='tiles',
+                  shown=progress_bar) as bar:
+        for future in as_completed(futures):
+            # A cluster would do again what a worker that dies has done for a
+            # future that somebody still holds.
+            number = futures.pop(future)
+            try:
+                outcomes[number] = future.result()
+            except Exception as error:  # noqa: BLE001 a worker may die of any
+                errors.append(error)
+            else:
+                if keep is not None:
+                    keep(number, outcomes[number])
+            del future
+            tell(len(outcomes) - len(futures), len(outcomes))
+            if not bar.disable:
+                _advance(bar, outcomes)
     return outcomes, errors
-
-
-def _bar(n):
-    from tqdm import tqdm
-    return tqdm(total=n, desc='tiles')
 
 
 def _advance(bar, outcomes):

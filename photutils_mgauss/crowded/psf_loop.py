@@ -21,6 +21,7 @@ from photutils_mgauss.field.fit import fit_mixture_field
 from photutils_mgauss.field.stages import n_terms
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.utils.image import with_unit
+from photutils_mgauss.utils.waiting import progress
 
 # The significance of the faintest stars of each pass; the last goes on.
 _THRESHOLDS = (40.0, 30.0, 20.0, 15.0, 12.0)
@@ -220,24 +221,24 @@ def fit_field(pixels, options, solve, effective_gain=None):
     """
     image = CrowdedImage.of(pixels, effective_gain)
     field = first_field(image, options.rules)
-    bar = _bar(options.max_passes) if options.progress_bar else None
     before = np.inf
-    for number in range(options.max_passes):
-        last, field = field, next_field(image, field, number, options, solve)
-        change = difference(field, last)
-        if bar is not None:
+    with progress(total=options.max_passes, desc='PSF',
+                  shown=options.progress_bar) as bar:
+        for number in range(options.max_passes):
+            last, field = field, next_field(image, field, number, options,
+                                            solve)
+            change = difference(field, last)
             _advance(bar, field, change)
-        if options.is_last_kind(number, field.degree, len(field.stars)) and (
-                change < _REST or change > _STALL * before):
-            break
-        before = change
-    else:
-        warnings.warn(
-            f'the PSF still changes by {change:.2%} from pass to pass after '
-            f'max_passes={options.max_passes}', AstropyUserWarning,
-            stacklevel=4)
-    if bar is not None:
-        bar.close()
+            if options.is_last_kind(
+                    number, field.degree, len(field.stars)) and (
+                        change < _REST or change > _STALL * before):
+                break
+            before = change
+        else:
+            warnings.warn(
+                f'the PSF still changes by {change:.2%} from pass to pass '
+                f'after max_passes={options.max_passes}', AstropyUserWarning,
+                stacklevel=4)
     return _with_unit(field, pixels.unit)
 
 
@@ -353,11 +354,6 @@ def difference(field, other):
                     for one in (field, other))
         squares.append(((new - old)**2).sum() / (new**2).sum())
     return float(np.sqrt(np.mean(squares)))
-
-
-def _bar(n):
-    from tqdm import tqdm
-    return tqdm(total=n, desc='PSF')
 
 
 def _advance(bar, field, change):

@@ -1,7 +1,7 @@
 """How far the fit of a field has got: a bar with its present stage."""
 from contextlib import contextmanager
 
-from tqdm import tqdm
+from photutils_mgauss.utils import waiting
 
 
 @contextmanager
@@ -15,7 +15,7 @@ def progress(workers, shown):
     if not shown:
         yield
         return
-    with tqdm(desc='PSF field', unit=' passes') as bar:
+    with waiting.progress(desc='PSF field', unit=' passes') as bar:
         def told(stage):
             if stage is None:
                 bar.update()

@@ -6,7 +6,6 @@ density per native pixel at :math:`((i - x_o) / s_x, (j - y_o) / s_y)` from
 the star, with :math:`(x_o, y_o)` the origin and s the oversampling. So the
 pixels of a PSF of unit flux sum to :math:`s_x s_y`, as in photutils.
 """
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import partial
@@ -327,7 +326,7 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
         has_error=pixels.error is not None)
     weights = _as_weights(pixels)
     starts = _as_starts(start, len(images), problem)
-    with waiting('fit_mixture') if not single else nullcontext():
+    with waiting('fit_mixture'):
         fits = map_chunks(partial(_fit_stack, problem),
                           (images, weights, starts), executor,
                           most=_LARGEST_CHUNK)

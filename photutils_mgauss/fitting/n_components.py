@@ -8,7 +8,9 @@ from photutils_mgauss.fitting.image import fit_mixture, fit_with_unit
 from photutils_mgauss.fitting.phases import phase_error, phase_rows
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.image import read_pixels
+from photutils_mgauss.utils.parallel import told
 from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['compare_n_components', 'select_n_components']
 
@@ -60,14 +62,15 @@ def compare_n_components(image, n_components=(1, 2, 3, 4, 5), **kwargs):
     image = pixels.data
     kwargs |= {'error': pixels.error, 'mask': pixels.mask}
     numbers = _as_numbers(n_components)
-    fit_mixture(image, 1, **kwargs)  # compiled before the clock starts
     fits, rows = [], []
-    for k in numbers:
-        start = time.perf_counter()
-        fits.append(fit_mixture(image, k, **kwargs))
-        seconds = time.perf_counter() - start
-        rows.append((k, seconds, *_measure(image, fits[-1], kwargs),
-                     fits[-1].message))
+    with waiting('compare_n_components'):
+        fit_mixture(image, 1, **kwargs)  # compiled before the clock starts
+        for k in told(numbers):
+            start = time.perf_counter()
+            fits.append(fit_mixture(image, k, **kwargs))
+            seconds = time.perf_counter() - start
+            rows.append((k, seconds, *_measure(image, fits[-1], kwargs),
+                         fits[-1].message))
     return QTable(rows=rows, names=('n_components', 'time', 'chi2', 'bic',
                                     *_CRITERIA, 'message'),
                   meta={'fits': [fit_with_unit(fit, pixels.unit)
@@ -162,10 +165,11 @@ float, optional
     if not limits:
         table = compare_n_components(image, n_components, **kwargs)
         return int(table['n_components'][np.argmin(table['bic'])])
-    for k in sorted(_as_numbers(n_components)):
-        row = compare_n_components(image, [k], **kwargs)[0]
-        if all(abs(row[name]) <= limit for name, limit in limits.items()):
-            return k
+    with waiting('select_n_components'):
+        for k in told(sorted(_as_numbers(n_components))):
+            row = compare_n_components(image, [k], **kwargs)[0]
+            if all(abs(row[name]) <= limit for name, limit in limits.items()):
+                return k
     found = ', '.join(f'{name} = {abs(row[name]):.3g}' for name in limits)
     msg = (f'n_components must reach further than {k} to meet the '
            f'thresholds; it gave {found}')

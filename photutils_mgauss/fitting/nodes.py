@@ -16,7 +16,6 @@ phases, see `photutils_mgauss.fitting.phases`.
 """
 import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
-from tqdm.auto import tqdm
 
 from photutils_mgauss.fitting.image import fit_mixture
 from photutils_mgauss.fitting.kept import fit_or_recall
@@ -26,6 +25,7 @@ from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.checkpoint import Checkpoint
 from photutils_mgauss.utils.parallel import available_cores
 from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
+from photutils_mgauss.utils.waiting import progress
 
 # Phases of the star within a pixel, along each axis.
 _PHASES = 4
@@ -135,7 +135,7 @@ def _chunks(n, progress_bar, kept):
         size = max(_KEPT, -(-n // 40))
     elif progress_bar:
         size = max(32 * available_cores(), -(-n // 40))
-    with tqdm(total=n, desc='Fitting nodes', disable=not progress_bar) as bar:
+    with progress(total=n, desc='Fitting nodes', shown=progress_bar) as bar:
         for i in range(0, n, size):
             yield slice(i, min(i + size, n))
             bar.update(min(size, n - i))

@@ -334,7 +334,7 @@ def sample_mixture(image, n_components=3, *, prior='scaled',
     data = SamplingData.prepare(image, fit, prior, unit, kwargs)
     seed = None if rng is None else int(as_rng(rng).integers(2**31))
     with waiting('sample_mixture', progress_bar):
-        idata = sample(build_model(data), sampler, progressbar=progress_bar,
+        idata = sample(build_model(data), sampler, progress_bar=progress_bar,
                        cores=cores, random_seed=seed, draws=draws,
                        tune=as_integer(tune, 'tune', minimum=0),
                        chains=as_integer(chains, 'chains', minimum=1))

@@ -11,6 +11,7 @@ import numpy as np
 
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.quiet import without_warnings
+from photutils_mgauss.utils.waiting import has_screen, progress
 
 # The paper's priors, in arcsec: Eq. 4.
 _PAPER_ALPHA, _PAPER_BETA, _PAPER_GAMMA, _PAPER_SIGMA = 0.037, 1.0, 0.9, 1.0
@@ -215,13 +216,20 @@ def _log_prior(data, u, log_sigma, omega, flux, alpha, beta, gamma):
 
 
 @without_warnings('PyTensor could not link to a BLAS')
-def sample(model, sampler, **options):
+def sample(model, sampler, *, progress_bar, **options):
     """Draw from a model; return arviz's object."""
     import pymc as pm
 
     if options['cores'] is None:
         del options['cores']
-    with model:
+    n_draws = options['chains'] * (options['tune'] + options['draws'])
+    # Other samplers have bars of their own.
+    own = sampler == 'pymc'
+    with model, progress(total=n_draws, desc='Sampling', unit=' draws',
+                         shown=own and progress_bar) as bar:
+        if not bar.disable:
+            options['callback'] = lambda trace, draw: bar.update()
         return pm.sample(nuts_sampler=sampler, target_accept=0.9,
-                         compute_convergence_checks=False,
-                         quiet=not options['progressbar'], **options)
+                         compute_convergence_checks=False, quiet=True,
+                         progressbar=progress_bar and not own
+                         and has_screen(), **options)

@@ -18,6 +18,7 @@ import astropy.units as u
 import numpy as np
 from astropy.table import QTable
 
+from photutils_mgauss.motions.joint import measured_ranks
 from photutils_mgauss.motions.loop import solve
 from photutils_mgauss.motions.priors import Priors
 from photutils_mgauss.motions.stacked import invert_2x2
@@ -36,8 +37,10 @@ def curvature_table(fit, ids):
         bent = replace(problem, acceleration=True, jerk=bends > 1)
         bent = replace(bent, priors=Priors.none(bent.n_parameters))
         estimates = solve(fit.setup, bent, fit.frames)
-        vector = estimates.values[-2:]
-        covariance = estimates.covariance[-2:, -2:]
+        # Rounding hides that a matrix is singular.
+        known = measured_ranks(bent) == bent.n_parameters
+        vector = np.where(known, estimates.values[-2:], np.nan)
+        covariance = np.where(known, estimates.covariance[-2:, -2:], np.nan)
         significance = _length(vector, covariance)
         vector, covariance = _towards_the_north(fit, vector, covariance)
         for k, axis in enumerate(('ra', 'dec')):

@@ -27,6 +27,22 @@ def doubts(fit):
     return (*found, *_large_floor(fit), *_lost_references(fit))
 
 
+def unsolved(fit, stars):
+    """Say what is missing where a table has no star with a motion."""
+    if not len(stars) or np.isfinite(stars['pmra']).any():
+        return
+    options = fit.setup.options
+    what = ', '.join(['position', 'motion', *['parallax'] * bool(
+        options.parallax), *['acceleration'] * options.acceleration])
+    enough = -(-fit.problem.n_parameters // 2)
+    most = int(fit.state.used.sum(axis=0).max(initial=0))
+    yield (f'No star has a motion: {" and ".join(what.rsplit(", ", 1))} take '
+           f'good detections at {enough} times or more, far enough apart, '
+           f'and no star has more than {most}.'
+           + (' Give more epochs, or leave the parallax out.'
+              if options.parallax else ''))
+
+
 def remarks(fit):
     """Return what else is not as it should be, a tuple of str."""
     return (*_without_errors(fit), *_far_away(fit), *_misfit(fit),

@@ -188,6 +188,8 @@ def mean_weights(values, covariance, rows, usable):
     Inverse variances, the scatter of the true motions included; stars far
     from the others (5 times their scatter) take no part.
     """
+    if not np.isfinite(values[rows][:, usable]).any():
+        return np.zeros(len(usable))
     middle = np.nanmedian(values[rows][:, usable], axis=1)[:, None]
     away = values[rows] - middle
     scatter = std_about_zero(away[:, usable])

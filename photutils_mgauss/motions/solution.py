@@ -12,7 +12,7 @@ from photutils_mgauss.motions.bootstrap import bootstrap_frames
 from photutils_mgauss.motions.corrected_epochs import correct_epochs
 from photutils_mgauss.motions.curvature import curvature_table
 from photutils_mgauss.motions.detectors import detector_residuals
-from photutils_mgauss.motions.doubts import doubts, remarks
+from photutils_mgauss.motions.doubts import doubts, remarks, unsolved
 from photutils_mgauss.motions.loop import (
     Fit,
     fitted_terms,
@@ -78,7 +78,7 @@ def solution_of(result, ref_epoch=None):
     corrected, residuals = correct_epochs(result)
     stars = _stars_at(result, year)
     alignment = alignment_table(result, residuals)
-    doubtful = doubts(result)
+    doubtful = (*unsolved(result, stars), *doubts(result))
     for sentence in doubtful:
         warnings.warn(sentence, AstropyUserWarning, stacklevel=3)
     notes = (*doubtful, *remarks(result), *result.frames.undetermined,
@@ -327,7 +327,8 @@ class MotionSolution:
             ``jerkra``, ``jerkdec``, their errors and ``jerk_significance``.
             A significance is the length of the vector in its errors; without
             any acceleration it exceeds 3 for one star in 90. NaN where there
-            are too few detections.
+            are too few detections: an acceleration takes three at different
+            times, a jerk four, and a parallax one more.
 
         Examples
         --------

@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-from tqdm.auto import tqdm
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.base import PSFModel
 from photutils_mgauss.psf.rows import strides
 from photutils_mgauss.utils.parallel import Threads, map_parallel
+from photutils_mgauss.utils.waiting import progress
 
 CONVERGED = (kernels.CONVERGED, kernels.STALLED)
 BAD_ERROR = kernels.BAD_ERROR
@@ -343,8 +343,8 @@ def fit_stars(image, psf, stars, *, fit_sky=False, max_iterations=100,
     stop = np.zeros(1, bool)
     work = partial(_fit_chunk, image, psf, fit_sky, max_iterations, stop)
     chunks = list(stars.chunks())
-    watch = partial(tqdm, desc='Fitting stars', total=len(chunks),
-                    disable=not progress_bar)
+    watch = partial(progress, desc='Fitting stars', total=len(chunks),
+                    shown=progress_bar)
     pool = (nullcontext(executor) if n_threads is None
             or executor is not None else Threads(n_threads))
     with pool as executor, _interruptible(stop), closing(map_parallel(

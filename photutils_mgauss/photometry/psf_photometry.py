@@ -46,8 +46,13 @@ from photutils_mgauss.utils.image import read_pixels, with_unit
 from photutils_mgauss.utils.per_thread import PerThread, keep
 from photutils_mgauss.utils.saturation import as_saturation
 from photutils_mgauss.utils.star_columns import plain_values
-from photutils_mgauss.utils.validation import as_choice, as_integer, as_real
-from photutils_mgauss.utils.waiting import waiting
+from photutils_mgauss.utils.validation import (
+    as_choice,
+    as_integer,
+    as_real,
+    check_callables,
+)
+from photutils_mgauss.utils.waiting import patient, waiting
 
 __all__ = ['MixturePSFPhotometry']
 
@@ -178,6 +183,8 @@ class MixturePSFPhotometry(PSFPhotometry):
     results = PerThread('The table of the last call.')
     psf_residual = PerThread('What the PSF leaves of bright stars.')
     _fit_info = PerThread('How the fits of the last call went.')
+    make_model_image = patient(PSFPhotometry.make_model_image)
+    make_residual_image = patient(PSFPhotometry.make_residual_image)
 
     def __init__(self, psf_model, fit_shape, *, fitter=None, executor=None,
                  n_threads=None, fit_sky=False, effective_gain=None,
@@ -185,6 +192,7 @@ class MixturePSFPhotometry(PSFPhotometry):
                  correlated_noise=True,
                  aperture_radius_correction=None, saturation=None,
                  residual_radius=None, **kwargs):
+        check_callables(kwargs, ('finder', 'grouper', 'local_bkg_estimator'))
         fitter = MixtureFitter() if fitter is None else fitter
         if n_threads is not None and compat.HAS_THREADS:
             kwargs['n_threads'] = n_threads

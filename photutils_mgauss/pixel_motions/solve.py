@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
-from tqdm.auto import tqdm
 
 from photutils_mgauss.kernels import Image
 from photutils_mgauss.photometry.joint_pixels import (
@@ -23,6 +22,7 @@ from photutils_mgauss.photometry.joint_pixels import (
 from photutils_mgauss.pixel_motions.posterior import posterior
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.utils.parallel import map_parallel
+from photutils_mgauss.utils.waiting import progress
 
 # Groups handed to a thread at a time, times stars in each, squared.
 _CHUNK = 2000
@@ -297,9 +297,9 @@ def _minimize(fit, spread_over, region):
 
 def _spread_over(executor, progress_bar, work, pieces):
     """Return what work makes of all pieces."""
-    return list(tqdm(map_parallel(work, pieces, executor=executor, long=True),
-                     desc='Fitting stars', total=len(pieces),
-                     disable=not progress_bar))
+    results = map_parallel(work, pieces, executor=executor, long=True)
+    return list(progress(results, desc='Fitting stars', total=len(pieces),
+                         shown=progress_bar))
 
 
 def _piece(fit, region, rows):

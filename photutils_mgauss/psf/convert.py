@@ -12,6 +12,8 @@ from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss.files.damage import UnusableFileError
 from photutils_mgauss.files.storage import read_stored
+from photutils_mgauss.utils.parallel import told
+from photutils_mgauss.utils.waiting import waiting
 
 # The kinds of files of which a user may choose an extension or a detector.
 _WITH_EXTENSIONS = ('psfex', 'stpsf', 'optical', 'epsf')
@@ -322,16 +324,17 @@ class GridConversions:
         radius = self._half_size().max() if radius is None else radius
         steps = np.arange(-np.ceil(radius * oversampling),
                           np.ceil(radius * oversampling) + 1) / oversampling
-        data = [scale * mixture.evaluate(
-                    steps, steps[:, None],
-                    pixel_integrated=self.pixel_integrated)
-                for mixture, scale in zip(self.mixtures, self.scales,
-                                          strict=True)]
         meta = {'grid_xypos': [tuple(xy) for xy in self.grid_xypos.tolist()],
                 'oversampling': oversampling}
-        return GriddedPSFModel(NDData(np.array(data), meta=meta),
-                               flux=self.flux.value, x_0=self.x_0.value,
-                               y_0=self.y_0.value)
+        with waiting('GriddedMixturePSF.to_gridded_psf'):
+            data = [scale * mixture.evaluate(
+                        steps, steps[:, None],
+                        pixel_integrated=self.pixel_integrated)
+                    for mixture, scale in zip(told(self.mixtures),
+                                              self.scales, strict=True)]
+            return GriddedPSFModel(NDData(np.array(data), meta=meta),
+                                   flux=self.flux.value, x_0=self.x_0.value,
+                                   y_0=self.y_0.value)
 
     def to_galsim(self, x, y):
         """
@@ -375,7 +378,8 @@ class GridConversions:
         -------
         `matplotlib.figure.Figure`
         """
-        return self.to_gridded_psf(2).plot_grid(**kwargs)
+        with waiting('GriddedMixturePSF.plot_grid'):
+            return self.to_gridded_psf(2).plot_grid(**kwargs)
 
 
 def _check_choices(path, kind, *, ext, detector):

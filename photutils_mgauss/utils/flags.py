@@ -9,7 +9,7 @@ from photutils.psf import decode_psf_flags
 
 # Ours stand out of the way of any that photutils may add.
 SATURATED, BLENDED, NOT_A_STAR = 1 << 16, 1 << 17, 1 << 18
-NOT_SEEN, REPEATED = 1 << 19, 1 << 20
+NOT_SEEN, REPEATED, MOTIONLESS = 1 << 19, 1 << 20, 1 << 21
 
 OWN_NAMES = {
     SATURATED: 'mostly_masked',
@@ -17,6 +17,7 @@ OWN_NAMES = {
     NOT_A_STAR: 'not_a_star',
     NOT_SEEN: 'not_detected',
     REPEATED: 'repeated_entry',
+    MOTIONLESS: 'no_motion',
 }
 
 

@@ -169,6 +169,13 @@ def tell(done, total):
         watcher(done, total)
 
 
+def told(pieces):
+    """Yield pieces of a sequence and tell who watches when each is done."""
+    for done, piece in enumerate(pieces, 1):
+        yield piece
+        tell(done, len(pieces))
+
+
 def _told(results, total):
     """Yield results and tell who watches about each."""
     for done, result in enumerate(results, 1):

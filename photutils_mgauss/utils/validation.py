@@ -136,6 +136,15 @@ def as_shape(value, name, *, minimum=1):
                  for n in pair)
 
 
+def check_callables(options, names):
+    """Raise if one of the options with these names cannot be called."""
+    for name in names:
+        value = options.get(name)
+        if not (value is None or callable(value)):
+            msg = f'{name} must be callable or None, got {value!r:.80}'
+            raise TypeError(msg)
+
+
 def as_choice(value, name, choices):
     """Return ``value`` if it is one of ``choices``."""
     if value not in choices:

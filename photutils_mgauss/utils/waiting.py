@@ -2,18 +2,25 @@
 Who waits at a terminal sees that something happens.
 
 A call that takes long shows its name, a clock and the parts of its work that
-are done, in a line that is gone when the call ends. There is none where its
-caller shows how far it is, and none in files, threads and other processes.
+are done, in a line that is gone when the call ends. Where it shows a bar, the
+clock of the bar goes on instead. Nothing is written into files, and no line
+is shown where the caller shows how far it is, in threads and other processes.
 """
 import sys
 from contextlib import contextmanager
+from functools import wraps
 from multiprocessing import parent_process
-from threading import Event, Thread, current_thread, main_thread
+from shutil import get_terminal_size
+from threading import Event, Lock, Thread, current_thread, main_thread
+from time import time
 
 from photutils_mgauss.utils.parallel import is_watched, watched
 
 # What ends sooner says nothing, and how often the clock goes on [s].
 _PATIENCE, _TICK = 2.0, 0.5
+
+# Whose line is on the screen, and who may change that.
+_SHOWN, _SCREEN = [], Lock()
 
 
 @contextmanager
@@ -26,22 +33,69 @@ def waiting(words, progress_bar=False):
     words : str
         What is done.
     progress_bar : bool, optional
-        Whether the call shows a bar of its own, so that nothing else should
-        be shown.
+        Whether the call is going to show a bar of its own. Its clock goes on
+        between its steps, and the line is shown before and after it only.
     """
     if is_watched() or not (progress_bar or _somebody_looks()):
         yield
         return
-    if progress_bar:
-        with watched(lambda _done, _total: None):
+    if not _somebody_looks():
+        with watched(_nobody):
             yield
         return
     line = _Line(words)
     try:
-        with watched(line.count):
+        with watched(_nobody if progress_bar else line.count):
             yield
     finally:
         line.close()
+
+
+def patient(method):
+    """Return a method that shows on a terminal that it is at work."""
+    @wraps(method)
+    def call(self, *args, **kwargs):
+        with waiting(f'{type(self).__name__}.{method.__name__}',
+                     self.progress_bar):
+            return method(self, *args, **kwargs)
+    return call
+
+
+def progress(iterable=None, *, shown=True, **options):
+    """
+    Return a bar that is shown on terminals and in notebooks, not in files.
+
+    Parameters
+    ----------
+    iterable : iterable, optional
+        What to go through.
+    shown : bool, optional
+        Whether a bar is wanted.
+    **options
+        Keywords of `tqdm.tqdm`.
+
+    Returns
+    -------
+    `tqdm.tqdm`
+    """
+    from tqdm.auto import tqdm
+    if not (shown and has_screen()):
+        return tqdm(iterable, disable=True, **options)
+    with _SCREEN:
+        for line in _SHOWN:
+            line.take_away()
+        return tqdm(iterable, ncols=_width(), **options)
+
+
+def has_screen():
+    """Whether what is written to the standard error is looked at."""
+    shell = sys.modules.get('IPython')
+    in_notebook = shell is not None and hasattr(shell.get_ipython(), 'kernel')
+    return in_notebook or (sys.stderr is not None and sys.stderr.isatty())
+
+
+def _nobody(_done, _total):
+    """Tell nobody of parts, because a bar shows them."""
 
 
 def _somebody_looks():
@@ -51,32 +105,66 @@ def _somebody_looks():
             and parent_process() is None)
 
 
+def _width():
+    """Return the width of a terminal that does not know it, else None."""
+    # Only those get the fallback.
+    return 80 if get_terminal_size((0, 0)).columns == 0 else None
+
+
 class _Line:
     """A line with a clock, drawn by a thread of its own."""
 
     def __init__(self, words):
         self._words = words
         self._parts = ''
+        self._bar = None
+        self._start = time()
         self._end = Event()
         self._thread = Thread(target=self._draw, daemon=True)
         self._thread.start()
 
     def count(self, done, total):
         """Take note of how many parts of the work are done."""
-        if total > 1:
-            self._parts = f', part {done} of {total}'
+        # Nobody knows how long what follows the last part will take.
+        self._parts = f', part {done} of {total}' if done < total else ''
 
     def close(self):
-        """Take the line away."""
+        """Take the line away for good."""
         self._end.set()
         self._thread.join()
+
+    def take_away(self):
+        """Take the line away until it is drawn again."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
 
     def _draw(self):
         if self._end.wait(_PATIENCE):
             return
+        _SHOWN.append(self)
+        try:
+            while True:
+                with _SCREEN:
+                    self._go_on()
+                if self._end.wait(_TICK):
+                    return
+        finally:
+            _SHOWN.remove(self)
+            self.take_away()
+
+    def _go_on(self):
+        """Let the clocks of all bars go on, or that of the line."""
         from tqdm import tqdm
-        with tqdm(bar_format=' ', leave=False) as bar:
-            bar.start_t -= _PATIENCE
-            while not self._end.wait(_TICK):
-                bar.bar_format = f'{self._words} [{{elapsed}}{self._parts}]'
+        with tqdm.get_lock():
+            bars = [bar for bar in tqdm._instances if bar is not self._bar]
+        if bars:
+            self.take_away()
+            for bar in bars:
                 bar.refresh()
+            return
+        if self._bar is None:
+            self._bar = tqdm(bar_format=' ', leave=False, ncols=_width())
+            self._bar.start_t = self._start
+        self._bar.bar_format = f'{self._words} [{{elapsed}}{self._parts}]'
+        self._bar.refresh()

@@ -93,6 +93,19 @@ def test_the_dry_run_shows_the_plan_and_writes_nothing(survey, capsys):
     assert sorted(survey.parent.iterdir()) == [survey]
 
 
+def test_the_plan_tells_fields_of_one_exposure(survey, capsys):
+    survey.write_text(re.sub('(?m)^references.*', '', survey.read_text()))
+    assert main(['survey', str(survey), '--dry-run']) == 0
+    said = capsys.readouterr().out
+    assert re.search(r'field0001: 1 exposure, too few for motions, 20\d\d\.'
+                     r'\d\d: noise', said)
+    assert 'no field will' not in said
+    survey.write_text(survey.read_text().replace('*.fits', '*h0.fits'))
+    assert main(['survey', str(survey), '--dry-run']) == 0
+    assert ('no field will have motions: they take two measured exposures'
+            in capsys.readouterr().out)
+
+
 def test_a_survey_ends_in_motions_and_runs_only_what_changed(survey, capsys):
     pytest.importorskip('pyarrow')
     folder = survey.parent / 'survey'

@@ -252,6 +252,17 @@ def test_wrong_usage_is_explained_by_the_command(capsys, words, said):
     assert f'usage: mgauss {words.split()[0]}' in text
 
 
+@pytest.mark.parametrize(('word', 'said'), [
+    ('fotometry', r'command: fotometry \(did you mean photometry\?\)'),
+    ('demmo', r'\(did you mean demo\?\)'),
+    ('zzz', 'unknown command: zzz; there are psf, photometry, motions')])
+def test_a_wrong_command_gets_a_hint(capsys, word, said):
+    with pytest.raises(SystemExit) as caught:
+        main([word, 'a.fits'])
+    assert caught.value.code == 2
+    assert re.search(said, capsys.readouterr().err)
+
+
 def test_help_fits_into_a_terminal(capsys):
     for command in ('psf', 'photometry', 'motions'):
         with pytest.raises(SystemExit):

@@ -1,4 +1,5 @@
 """Crowded fields: laws of the joint fit, of finding, and of tiles."""
+import sys
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from multiprocessing import get_context
 
@@ -678,12 +679,26 @@ def test_a_killed_worker_leaves_the_finished_tiles(crowd):
     assert (0, 64, 70, 140) in caught.value.unfinished
 
 
-def test_the_progress_bar_tells_of_stars_and_chi2(crowd, capsys):
-    photometry(progress_bar=True)(crowd[0][:50, :50],
-                                  error=crowd[1][:50, :50])
+def test_the_progress_bar_tells_of_stars_and_chi2(crowd, capsys,
+                                                  monkeypatch):
+    phot = photometry(progress_bar=True)
+    corner = crowd[0][:50, :50], crowd[1][:50, :50]
+    phot(corner[0], error=corner[1])
+    assert capsys.readouterr().err == ''  # no terminal
+    monkeypatch.setattr(sys.stderr, 'isatty', lambda: True, raising=False)
+    phot(corner[0], error=corner[1])
     shown = capsys.readouterr().err
     assert 'stars=' in shown
     assert 'chi2=' in shown
+
+
+@pytest.mark.parametrize(('keyword', 'said'), [
+    ('finder', ': it finds the stars itself, .* "init_params"'),
+    ('localbkg_estimator', ': the background is fitted: see "background_'),
+    ('fot', '$')])
+def test_what_replaces_keywords_of_photutils_is_said(keyword, said):
+    with pytest.raises(TypeError, match=f"no keyword '{keyword}'.*{said}"):
+        photometry(**{keyword: 3})
 
 
 @pytest.mark.parametrize(('keyword', 'value', 'error'), [

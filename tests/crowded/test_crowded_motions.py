@@ -18,6 +18,7 @@ from photutils_mgauss.crowded.many_equations import FARTHEST
 from photutils_mgauss.crowded.many_table import _by_itself
 from photutils_mgauss.crowded.many_tile import ManyTile
 from photutils_mgauss.crowded.stars import Stars
+from photutils_mgauss.utils.flags import MOTIONLESS, decode
 
 YEARS = np.array([-2.5, -1.5, -0.5, 0.5, 1.5, 2.5])
 
@@ -103,6 +104,31 @@ def test_stars_of_one_image_have_a_place_and_no_motion():
     assert_allclose(covariance[:, :2, :2], place[:, :2, :2])
     assert np.isnan(covariance[:, 2:, 2:]).all()
     assert_array_equal(alone.x, stars.x)
+
+
+def test_stars_without_a_motion_have_a_flag():
+    rng = np.random.default_rng(8)
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.crval = ('RA---TAN', 'DEC--TAN'), (30.0, 5.0)
+    wcs.wcs.cdelt = -2e-5, 2e-5
+    x, y = np.array([[10.3, 22.1, 46.2], [12.2, 19.7, 14.8]])
+    images = []
+    for year, width in ((2026, 55), (2028, 35)):
+        light = 40 + render_stars(a_psf(0.8), x, y, np.full(3, 3e4),
+                                  (30, width))
+        images.append(ImageEpoch(rng.normal(light, np.sqrt(light)),
+                                 a_psf(0.8), wcs, year, error=np.sqrt(light),
+                                 band='g'))
+    phot = CrowdedMixturePhotometry(None)
+    table = phot.fit_images(images, motions=True)
+    unknown = ~np.isfinite(table['pmra'].value)
+    assert_array_equal(unknown, table['n_images'] == 1)
+    assert_array_equal((table['flags'] & MOTIONLESS) > 0, unknown)
+    assert unknown.sum() == 1
+    assert decode(MOTIONLESS) == ['no_motion']
+    # Nothing is missing where no motions are asked for.
+    table = phot.fit_images(images)
+    assert not (table['flags'] & MOTIONLESS).any()
 
 
 def test_how_stars_move_is_learnt_from_the_best_known():

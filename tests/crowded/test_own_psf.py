@@ -1,4 +1,5 @@
 """The PSF of a crowded image from its own stars."""
+import sys
 from functools import cache
 
 import astropy.units as u
@@ -176,7 +177,8 @@ def test_a_checkpoint_gives_the_same(tmp_path):
 
 
 @pytest.mark.filterwarnings('ignore:the PSF still changes')
-def test_a_bar_shows_the_passes(capfd):
+def test_a_bar_shows_the_passes(capfd, monkeypatch):
+    monkeypatch.setattr(sys.stderr, 'isatty', lambda: True, raising=False)
     fit_crowded_psf(**corner(), **QUICK, max_passes=2, progress_bar=True)
     assert 'stars=' in capfd.readouterr().err
 

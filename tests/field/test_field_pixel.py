@@ -1,4 +1,5 @@
 """Fields of optics that are integrated over pixels."""
+import sys
 import warnings
 
 import numpy as np
@@ -163,13 +164,14 @@ def test_a_ring_of_light_does_not_decide_the_core():
     assert np.hypot(x.std(), y.std()) < 0.02
 
 
-def test_a_bar_shows_what_is_being_fitted(capsys):
+def test_a_bar_shows_what_is_being_fitted(capsys, monkeypatch):
+    fitted()
+    assert capsys.readouterr().err == ''
+    monkeypatch.setattr(sys.stderr, 'isatty', lambda: True, raising=False)
     fitted(progress_bar=True)
     shown = capsys.readouterr().err
     assert 'PSF field' in shown
     assert 'all stars' in shown
-    fitted()
-    assert capsys.readouterr().err == ''
 
 
 @pytest.mark.parametrize('share', [0.02, 0.05])

@@ -1,4 +1,5 @@
 """Grids of mixtures from everything that photutils and PSFEx hand over."""
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -161,7 +162,8 @@ def test_nodes_may_look_for_their_own_start():
         GriddedMixturePSF.from_gridded_psf(epsf_grid(), 2, start='best')
 
 
-def test_one_call_does_a_focal_plane_on_any_executor(capsys):
+def test_one_call_does_a_focal_plane_on_any_executor(capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, 'isatty', lambda: True, raising=False)
     with ThreadPoolExecutor(1) as pool:
         psfs = GriddedMixturePSF.from_gridded_psf(
             {'A': epsf_grid(), 'B': epsf_grid(oversampling=2)}, 2,

@@ -1,9 +1,12 @@
 """Accelerations and jerks of stars, beside polynomials fitted by NumPy."""
 import astropy.units as u
 import numpy as np
+import pytest
 from astropy.table import Table
+from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_allclose
 
+from helpers.wcs import tan_wcs
 from photutils_mgauss import Epoch, ProperMotionFitter
 
 YEARS = np.array([2010.0, 2011.1, 2012.4, 2014.0, 2015.2, 2016.9, 2018.3,
@@ -106,3 +109,35 @@ def test_on_the_sky_they_are_towards_east_and_north(rng):
     assert table['accdec'].unit == u.mas / u.yr**2
     assert_allclose(table['accdec'][4].value, 0.5, atol=1e-3)
     assert_allclose(table['accra'][4].value, 0, atol=1e-3)
+
+
+def on_the_sky(rng, n_epochs, n=60):
+    """Return the epochs of stars that stand still, one each year."""
+    place = rng.uniform(0, 9000, (2, n))
+    epochs = []
+    for year in 2018.0 + np.arange(n_epochs):
+        x, y = place + rng.normal(0, ERROR, (2, n))
+        epochs.append(Epoch(Table({
+            'id': np.arange(n), 'x_fit': x, 'y_fit': y,
+            'x_err': np.full(n, ERROR), 'y_err': np.full(n, ERROR)}),
+            tan_wcs(100, 20), year))
+    return epochs
+
+
+@pytest.mark.parametrize('parallax', [False, True])
+def test_accelerations_take_as_many_epochs_as_the_pages_say(rng, parallax):
+    for n_epochs in (3, 4, 5):
+        fitter = ProperMotionFitter(parallax=parallax)
+        table = fitter.fit(on_the_sky(rng, n_epochs)).accelerations()
+        for name, enough in (('acc', 3), ('jerk', 4)):
+            known = np.isfinite(table[f'{name}_significance'])
+            assert (known == (n_epochs >= enough + parallax)).all()
+
+
+def test_a_parallax_of_two_epochs_is_refused_in_words(rng):
+    with pytest.warns(AstropyUserWarning, match='No star has a motion: posit'
+                      'ion, motion and parallax take .* 3 times') as caught:
+        solution = ProperMotionFitter(parallax=True).fit(on_the_sky(rng, 2))
+    assert len(caught) == 1
+    assert str(caught[0].message) in solution.notes
+    assert (solution.stars['flags'] & 1 == 1).all()

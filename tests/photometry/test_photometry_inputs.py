@@ -1,7 +1,10 @@
 """Photometry of whatever users hand over: each trouble stays where it is."""
 import signal
+import sys
 import time
 import warnings
+from functools import partial
+from itertools import product
 
 import numpy as np
 import pytest
@@ -168,16 +171,26 @@ def test_a_number_of_steps_that_is_none_is_refused(rng, steps, kind):
                         maxiter=steps)
 
 
-def test_a_progress_bar_is_shown_if_asked_for(rng, capsys):
+@pytest.mark.parametrize('name', ['finder', 'grouper',
+                                  'local_bkg_estimator'])
+def test_what_cannot_be_called_is_named(name):
+    with pytest.raises(TypeError, match=f'{name} must be callable.* got 3'):
+        MixturePSFPhotometry(PSF, 9, **{name: 3})
+
+
+def test_a_progress_bar_is_shown_on_terminals_if_asked_for(
+        rng, capsys, monkeypatch):
     x, y = lattice(rng)
     flux = np.full(x.size, 2e4)
     data, error = observe(x, y, flux, rng)
     start = QTable({'x': x, 'y': y, 'flux': flux})
-    for shown in (False, True):
-        MixturePSFPhotometry(PSF, 9, progress_bar=shown)(
+    for wanted, terminal in product((False, True), repeat=2):
+        monkeypatch.setattr(sys.stderr, 'isatty',
+                            partial(bool, terminal), raising=False)
+        MixturePSFPhotometry(PSF, 9, progress_bar=wanted)(
             data, error=error, init_params=start)
         written = capsys.readouterr()
-        assert ('100%' in written.err) == shown
+        assert ('100%' in written.err) == (wanted and terminal)
         assert not written.out
 
 

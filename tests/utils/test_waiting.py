@@ -1,4 +1,5 @@
 """Who waits at a terminal is told, and nobody else."""
+import os
 import re
 import sys
 import time
@@ -9,7 +10,7 @@ import pytest
 
 from photutils_mgauss.utils import waiting as module
 from photutils_mgauss.utils.parallel import map_parallel, tell, watched
-from photutils_mgauss.utils.waiting import waiting
+from photutils_mgauss.utils.waiting import patient, progress, waiting
 
 
 class Terminal(StringIO):
@@ -31,10 +32,14 @@ def work(seen=None):
     """Wait until something is seen, or a moment where nothing should be."""
     with waiting('measure'):
         tell(1, 3)
-        end = time.monotonic() + (60 if seen else 0.2)
-        while time.monotonic() < end and (
-                seen is None or seen not in sys.stderr.getvalue()):
-            time.sleep(0.01)
+        look(seen)
+
+
+def look(seen=None):
+    end = time.monotonic() + (60 if seen else 0.2)
+    while time.monotonic() < end and (
+            seen is None or seen not in sys.stderr.getvalue()):
+        time.sleep(0.01)
 
 
 def test_a_long_call_shows_its_name_a_clock_and_its_parts(monkeypatch):
@@ -83,17 +88,12 @@ def in_pieces():
     list(map_parallel(lambda _: work(), range(2)))
 
 
-def beside_a_bar():
-    with waiting('outer', progress_bar=True):
-        work()
-
-
 def told_already():
     with watched(lambda _done, _total: None):
         work()
 
 
-@pytest.mark.parametrize('call', [in_a_thread, in_pieces, beside_a_bar,
+@pytest.mark.parametrize('call', [in_a_thread, in_pieces,
                                   told_already])
 def test_nothing_is_shown_where_others_show_it_or_nobody_looks(
         monkeypatch, call):
@@ -102,7 +102,65 @@ def test_nothing_is_shown_where_others_show_it_or_nobody_looks(
     assert screen.getvalue() == ''
 
 
-def test_files_get_no_line(capsys, monkeypatch):
+def test_files_get_neither_line_nor_bar(capsys, monkeypatch):
     monkeypatch.setattr(module, '_PATIENCE', 0.01)
     work()
+    with waiting('outer', progress_bar=True):
+        list(progress([1, 2], desc='pieces'))
+        work()
     assert capsys.readouterr().err == ''
+
+
+def test_the_clock_of_a_bar_goes_on_within_a_step(monkeypatch):
+    screen = terminal(monkeypatch)
+    with waiting('outer', progress_bar=True), progress(total=1) as bar:
+        # Half a minute has passed since it was drawn.
+        bar.start_t -= 30
+        look('[00:3')
+    assert 'outer' not in screen.getvalue()
+
+
+def test_the_line_is_shown_before_and_after_a_bar(monkeypatch):
+    screen = terminal(monkeypatch)
+    with waiting('outer', progress_bar=True):
+        look('outer')
+        with progress(total=1, desc='pieces') as bar:
+            before = screen.getvalue()
+            # The line has gone when the bar is there.
+            assert before.rindex('pieces') > before.rindex('outer')
+            work()
+            bar.update()
+        assert 'outer' not in screen.getvalue()[len(before):]
+        screen.truncate(0)
+        look('outer')
+    assert 'measure' not in screen.getvalue()
+
+
+def test_a_bar_is_as_wide_as_a_terminal_that_does_not_know_its_width(
+        monkeypatch):
+    terminal(monkeypatch)
+    for known, eighty in ((0, True), (70, False)):
+        monkeypatch.setattr(module, 'get_terminal_size',
+                            lambda _, known=known: os.terminal_size(
+                                (known, 24)))
+        with progress(total=1) as bar:
+            assert (bar.ncols == 80) == eighty
+
+
+class Photometry:
+    """Has a call that takes long."""
+
+    progress_bar = False
+
+    @patient
+    def draw(self, seen, *, again=False):
+        """Draw stars."""
+        look(seen)
+        return seen, again
+
+
+def test_methods_of_other_packages_show_their_name(monkeypatch):
+    screen = terminal(monkeypatch)
+    assert Photometry().draw('Photometry.draw [', again=True)[1]
+    assert Photometry.draw.__doc__ == 'Draw stars.'
+    assert 'Photometry.draw [' in screen.getvalue()
