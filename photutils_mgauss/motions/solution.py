@@ -78,10 +78,10 @@ def solution_of(result, ref_epoch=None):
     corrected, residuals = correct_epochs(result)
     stars = _stars_at(result, year)
     alignment = alignment_table(result, residuals)
-    doubtful = (*unsolved(result, stars), *doubts(result))
+    doubtful = doubts(result)
     for sentence in doubtful:
         warnings.warn(sentence, AstropyUserWarning, stacklevel=3)
-    notes = (*doubtful, *remarks(result), *result.frames.undetermined,
+    notes = (*unsolved(result, stars), *doubtful, *remarks(result), *result.frames.undetermined,
              *result.setup.notes, *result.setup.sightings.notes)
     return MotionSolution(stars, corrected, alignment, notes, result)
 
