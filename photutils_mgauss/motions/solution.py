@@ -81,8 +81,9 @@ def solution_of(result, ref_epoch=None):
     doubtful = doubts(result)
     for sentence in doubtful:
         warnings.warn(sentence, AstropyUserWarning, stacklevel=3)
-    notes = (*unsolved(result, stars), *doubtful, *remarks(result), *result.frames.undetermined,
-             *result.setup.notes, *result.setup.sightings.notes)
+    notes = (*unsolved(result, stars), *doubtful, *remarks(result),
+             *result.frames.undetermined, *result.setup.notes,
+             *result.setup.sightings.notes)
     return MotionSolution(stars, corrected, alignment, notes, result)
 
 
