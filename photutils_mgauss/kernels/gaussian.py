@@ -40,7 +40,7 @@ _LOG2_LOW = float(Decimal(2).ln() - Decimal(_LOG2_HIGH))
 _TERMS = tuple(1 / factorial(n) for n in range(13, -1, -1))
 
 
-@inner
+@inner(fastmath={'contract'})
 def fast_exp(x):
     """Return exp(x) for x <= 0, and 0 where that is below 1e-299."""
     shifted = x * _LOG2_E + _ROUND

@@ -34,7 +34,7 @@ class GroupMoments(NamedTuple):
 
 
 @inner
-def _leave_repeats(boxes, c, variance):
+def _leave_repeats(boxes, c, weight):
     """
     Leave the pixels of box c out that an earlier box has, too.
 
@@ -50,21 +50,21 @@ def _leave_repeats(boxes, c, variance):
                 k = i * height + j
                 y, x = row + j, column + i
                 if (top <= y < bottom and left <= x < right
-                        and variance[k] < np.inf):
-                    variance[k] = np.inf
+                        and weight[k] > 0):
+                    weight[k] = 0.0
                     n += 1
     return n
 
 
 @inner
-def _load(image, boxes, data, variance):
+def _load(image, boxes, data, weights):
     """Fetch the pixels of a group, each once; return how many there are."""
     total = 0
     for c in range(boxes.shape[0]):
-        n = gather(image, boxes[c], 0.0, data[c], variance[c])
+        n = gather(image, boxes[c], 0.0, data[c], weights[c])
         if n < 0:
             return -1
-        total += n - _leave_repeats(boxes, c, variance[c])
+        total += n - _leave_repeats(boxes, c, weights[c])
     return total
 
 
@@ -73,7 +73,7 @@ def _add_own(boxes, own, psf, scratch, data):
     """Add light of stars (m, 3: flux, x, y) that the image is without."""
     for c in range(boxes.shape[0]):
         area = boxes[c, 2] * boxes[c, 3]
-        derivatives = scratch.derivatives[0, :, :area]
+        derivatives = scratch.derivatives[0]
         for s in range(own.shape[0]):
             if own[s, 0] == 0.0:
                 continue
@@ -123,11 +123,11 @@ def group_moments(image, boxes, places, own, psf, parameters, scratch, out):
     room for it. Worked on are parameters (3 m + 1,), all 0, and a BoxScratch.
     """
     m, size = boxes.shape[1], out.data.shape[1]
-    data, variance, new, around, chi2 = scratch
+    data, weights, new, around, chi2 = scratch
     if m > 1:  # a single star is always looked at
         find_reach(psf, around.sight)
     for g in range(boxes.shape[0]):
-        n_pixels = _load(image, boxes[g], data, variance)
+        n_pixels = _load(image, boxes[g], data, weights)
         out.n_pixels[g] = n_pixels
         if n_pixels <= 0:
             _blank(g, out)
@@ -138,7 +138,7 @@ def group_moments(image, boxes, places, own, psf, parameters, scratch, out):
             parameters[3 * s] = 1.0
             parameters[3 * s + 1] = places[g, s, 0]
             parameters[3 * s + 2] = places[g, s, 1]
-        pixels = Pixels(boxes[g], data, variance, 0.0)
+        pixels = Pixels(boxes[g], data, weights, 0.0)
         normal_equations(parameters, m, size > 3 * m, pixels, psf, around,
                          new, new, chi2)
         _put(new, pixels, m, size, g, out)

@@ -88,6 +88,16 @@ def sums(function):
                  fastmath={'reassoc', 'contract', 'nsz'})
 
 
+def apart(function):
+    """
+    Compile a loop over arrays that share no memory, else like `sums`.
+
+    Then what it changes in one place stays in registers until it is done.
+    """
+    return inner(function, pipeline=_ApartCompiler,
+                 fastmath={'reassoc', 'contract', 'nsz'})
+
+
 def folder():
     """Return where compiled code is kept, or None where it cannot be."""
     return next((dispatcher._cache.cache_path
@@ -428,6 +438,16 @@ class _LoopCompiler(_KernelCompiler):
     """The same for code that is put into kernels."""
 
     prepare = _LendCode
+
+
+class _ApartCompiler(_LoopCompiler):
+    """The same for code whose arrays do not overlap."""
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        flags = Flags(self.state.flags)
+        flags.noalias = True
+        self.state.flags = _KnownFlags.of(flags)
 
 
 class _InnerCompiler(_KernelCompiler):

@@ -26,6 +26,7 @@ from photutils_mgauss.kernels.star_normal import (
     find_reach,
     gather,
     normal_equations,
+    step_ahead,
 )
 
 # Fits of stars: flux, x and y of each, by Levenberg-Marquardt. The stars of a
@@ -87,10 +88,12 @@ class _Work(NamedTuple):
     """
     Vectors and matrices of one step; columns (3, size), block (3, 3).
 
-    share (n,) is by how much each star lowers chi2, status (n,) its outcome.
+    undamped is a step as it would be without damping. share (n,) is by how
+    much each star lowers chi2, status (n,) its outcome.
     """
 
     step: np.ndarray
+    undamped: np.ndarray
     trial: np.ndarray
     frozen: np.ndarray
     scale: np.ndarray
@@ -104,8 +107,9 @@ class _Work(NamedTuple):
     @classmethod
     def empty(cls, n):
         size = 3 * n + 1
-        return cls(np.empty(size), np.empty(size), np.empty(size, bool),
-                   np.empty(size), np.empty((size, size)), np.empty(size),
+        return cls(np.empty(size), np.empty(size), np.empty(size),
+                   np.empty(size, bool), np.empty(size),
+                   np.empty((size, size)), np.empty(size),
                    np.empty((3, size)), np.empty((3, 3)), np.empty(n),
                    np.empty(n, np.int64))
 
@@ -166,11 +170,14 @@ def _step_size(step, parameters, matrix, n):
 
 
 @inner
-def _undamp(step, matrix, gradient, frozen, size):
+def _undamp(damping, equations, size, work):
     """Lengthen a damped step to what each parameter alone would go."""
-    for a in range(size):
-        if not frozen[a]:
-            step[a] = max(abs(step[a]), abs(gradient[a]) / matrix[a, a])
+    copy_vector(work.step, size, work.undamped)
+    if damping > 0:
+        for a in range(size):
+            if not work.frozen[a]:
+                alone = abs(equations.gradient[a]) / equations.matrix[a, a]
+                work.undamped[a] = max(abs(work.step[a]), alone)
 
 
 @inner
@@ -277,27 +284,26 @@ def _begin(parameters, n, fit_sky, pixels, psf, scratch, work, equations,
 
 
 @inner
-def _propose(parameters, equations, limits, n, size, work):
+def _propose(parameters, equations, limits, damping, n, size, work):
     """
     Put the next step, and its end, into work.
 
-    Returns by how much chi2 should fall, and the step's size.
+    Returns by how much chi2 should fall, the step's size, and that which it
+    would have without damping.
     """
     _solve(parameters, equations, limits, n, size, work)
+    _undamp(damping, equations, size, work)
     return (_expected(work.step, equations, size),
-            _step_size(work.step, parameters, equations.matrix, n))
+            _step_size(work.step, parameters, equations.matrix, n),
+            _step_size(work.undamped, parameters, equations.matrix, n))
 
 
 @inner
-def _accept(parameters, old, new, damping, n, size, work):
-    """Take the step; return its size, were it not damped."""
+def _accept(parameters, old, new, n, size, work):
+    """Take the step."""
     _share_fall(work.step, old, new, n, work.share)
-    if damping > 0:
-        _undamp(work.step, old.matrix, old.gradient, work.frozen, size)
-    length = _step_size(work.step, parameters, old.matrix, n)
     copy_vector(work.trial, size, parameters)
     _keep(new, n, size, old)
-    return length
 
 
 @inner
@@ -308,13 +314,16 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
 
     Puts the outcome of each star into work.status and returns the number of
     evaluations; old holds the equations at the result, chi2[1] its sum of
-    squares.
+    squares. The last step of a single star, at most some 3e-5 pixels, is not
+    evaluated: what it changes is known from the derivatives.
     """
     size = 3 * n + fit_sky
     best = _begin(parameters, n, fit_sky, pixels, psf, scratch, work, old,
                   chi2)
     floor = 1e-24 * best
     damping, last, fall = 0.0, 0.0, np.inf
+    # Whether the derivatives of the one star there is are those of old.
+    known = n == 1
     for iteration in range(max_iterations):
         _freeze(parameters, limits, old.gradient, size, work.frozen)
         if not _factorize(old, damping, size, work, scratch.stop):
@@ -322,15 +331,22 @@ def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
             if damping > 1e3:
                 return _end(_NOT_CONVERGED, n, work.status, iteration + 1)
             continue
-        expected, short = _propose(parameters, old, limits, n, size, work)
+        expected, short, length = _propose(parameters, old, limits, damping,
+                                           n, size, work)
+        if known and remainder(length, last) < STEP_TOLERANCE:
+            step_ahead(parameters, work.step, fit_sky, pixels, scratch, old,
+                       chi2)
+            copy_vector(work.trial, size, parameters)
+            return _end(CONVERGED, n, work.status, iteration + 1)
         normal_equations(work.trial, n, fit_sky, pixels, psf, scratch, old,
                          new, chi2)
         if not chi2[0] <= best * (1 + 1e-12) + floor:
             if short < 1e-3 * STEP_TOLERANCE or damping > 1e12:
                 return _end(STALLED, n, work.status, iteration + 2)
-            damping, last = max(10 * damping, 1e-3), 0.0
+            damping, last, known = max(10 * damping, 1e-3), 0.0, False
             continue
-        length = _accept(parameters, old, new, damping, n, size, work)
+        _accept(parameters, old, new, n, size, work)
+        known = n == 1
         fall = best - chi2[0]
         # Of a smaller fall nothing is left after rounding: keep the damping.
         gain = fall / expected if expected > 1e-9 * best else POOR_GAIN
@@ -396,7 +412,7 @@ def _measure_fit(initial, boxes, equations, n, out):
 
 @inner
 def _load_group(image, stars, first, n, fixed, parameters, limits, data,
-                variance):
+                weights):
     """
     Fetch the pixels, initial values and limits of the n stars from first on.
 
@@ -407,7 +423,7 @@ def _load_group(image, stars, first, n, fixed, parameters, limits, data,
     for s in range(n):
         i = first + s
         got = gather(image, stars.boxes[i], stars.sky[i], data[s],
-                     variance[s])
+                     weights[s])
         if got < 0:
             return -1
         n_pixels += got
@@ -452,15 +468,15 @@ def _fit_group(image, stars, first, n, fixed, fit_sky, psf, max_iterations,
                scratch, fits):
     """Fit the n stars from first on; see `fit_stars`."""
     boxes, old, work, limits, parameters = scratch
-    data, variance, new, around, chi2 = boxes
+    data, weights, new, around, chi2 = boxes
     n_pixels = _load_group(image, stars, first, n, fixed, parameters, limits,
-                           data, variance)
+                           data, weights)
     if n_pixels < 0:
         for s in range(first, first + n):
             fits.outcome[s, 0] = BAD_ERROR
         return
     rows = slice(first, first + n)
-    pixels = Pixels(stars.boxes[rows], data, variance, image.gain)
+    pixels = Pixels(stars.boxes[rows], data, weights, image.gain)
     evaluations = _minimize(
         parameters, n, fit_sky, pixels, psf, around, work, old, new, limits,
         max_iterations, chi2)

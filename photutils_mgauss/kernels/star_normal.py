@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from photutils_mgauss.kernels.jit import inner, kernel, sums
+from photutils_mgauss.kernels.jit import apart, inner, kernel, sums
 from photutils_mgauss.kernels.tile import LANES, SCRATCH, fill_derivatives
 
 # A group of n stars is seen on the pixels of its n boxes, (first row, first
@@ -13,12 +13,12 @@ from photutils_mgauss.kernels.tile import LANES, SCRATCH, fill_derivatives
 # y of the first star, of the second, ..., and last, where it is fitted, the
 # sky level common to the group.
 
-# Where the unit-flux image of a star is nowhere above this in a box, the star
-# is left out of its pixels.
+# Where the root of the sum of squares of a star's unit-flux image in a box is
+# not above this, the star is left out of its pixels.
 _UNSEEN = 1e-18
 
-# Of the peak: where a star is nowhere above this in the box of another, the
-# box is left out of its rows of the normal matrix, though not of its gradient.
+# Of the peak: where that root is not above this in the box of another, the box
+# is left out of what joins the two in the normal matrix.
 # The minimum stays where it is, and errors change by the square of this.
 _FAINT = 1e-5
 
@@ -46,11 +46,15 @@ class Image(NamedTuple):
 
 
 class Pixels(NamedTuple):
-    """The boxes of a group (n, 4), their data and variances (n, area)."""
+    """
+    The boxes of a group (n, 4), their data and weights (n, area).
+
+    The weights are those without the light of stars.
+    """
 
     boxes: np.ndarray
     data: np.ndarray
-    variance: np.ndarray
+    weights: np.ndarray
     gain: float
 
 
@@ -120,12 +124,12 @@ class BoxScratch(NamedTuple):
     """
     The memory in which equations of at most n stars are made.
 
-    data and variance (n, area) of boxes of at most area pixels, the equations,
+    data and weights (n, area) of boxes of at most area pixels, the equations,
     the stars around a box, and the sums of squares chi2 (2,).
     """
 
     data: np.ndarray
-    variance: np.ndarray
+    weights: np.ndarray
     equations: Equations
     around: Scratch
     chi2: np.ndarray
@@ -153,74 +157,97 @@ def count_pixels(mask, boxes, out):
 
 
 @inner
-def gather(image, box, sky, data, variance):
+def gather(image, box, sky, data, weight):
     """
     Copy the pixels of a box less its sky, column after column.
 
-    Masked pixels get an infinite variance. Returns the number of pixels, or
-    -1 if an error is not positive and finite.
+    Masked pixels get a weight of 0. Returns the number of pixels, or -1 if an
+    error is not positive and finite.
     """
     row, column, height, width = box
     n = 0
-    for i in range(width):
-        for j in range(height):
+    for j in range(height):
+        for i in range(width):
             k = i * height + j
             y, x = row + j, column + i
             if image.mask.size and image.mask[y, x]:
                 data[k] = 0.0
-                variance[k] = np.inf
+                weight[k] = 0.0
                 continue
             data[k] = image.data[y, x] - sky
-            variance[k] = 1.0
+            weight[k] = 1.0
             n += 1
             if image.error.size:
                 sigma = image.error[y, x]
                 if not 0 < sigma < np.inf:
                     return -1
-                variance[k] = sigma * sigma
+                weight[k] = 1 / (sigma * sigma)
     return n
 
 
-@inner
-def _weigh(data, variance, sky, gain, old, residual, weight, chi2):
+@sums
+def _weigh(data, known, sky, gain, old, residual, weight, chi2):
     """
     Turn the model of the stars in residual into residuals, and weigh them.
 
-    weight takes the new weights; chi2 (2,) gets the sums of squares with the
-    old weights and with the new ones added. A gain of 0 means that variance
-    does not depend on the model.
+    known holds the weights without stars' light, weight takes the new ones;
+    chi2 (2,) gets the sums of squares with the old weights and with the new
+    ones added. A gain of 0 means that weights do not depend on the model.
     """
     with_old = 0.0
     with_new = 0.0
+    light = 1 / gain if gain > 0 else 0.0
     for i in range(data.size):
         model = residual[i]
-        v = variance[i]
-        if gain > 0 and model > 0:
-            v += model / gain
-        w = 1 / v
+        w = known[i]
+        w /= 1 + w * light * max(model, 0.0)
         r = data[i] - sky - model
+        before = old[i]
         weight[i] = w
         residual[i] = r
-        with_old += old[i] * r * r
+        with_old += before * r * r
         with_new += w * r * r
     chi2[0] += with_old
     chi2[1] += with_new
 
 
-@sums
-def _add_gradient(derivatives, i, flux, weight, residual, a, gradient):
-    """Add star i's part of the right-hand side in one box, at a."""
+@apart
+def _add_own(derivatives, i, flux, weight, residual, a, gradient, matrix):
+    """Add star i's part of the equations in one box, at a."""
     b0 = 0.0
     b1 = 0.0
     b2 = 0.0
+    a00 = 0.0
+    a10 = 0.0
+    a11 = 0.0
+    a20 = 0.0
+    a21 = 0.0
+    a22 = 0.0
     for k in range(weight.size):
-        wr = weight[k] * residual[k]
-        b0 += wr * derivatives[i, 0, k]
-        b1 += wr * derivatives[i, 1, k]
-        b2 += wr * derivatives[i, 2, k]
+        t0 = derivatives[i, 0, k]
+        t1 = derivatives[i, 1, k]
+        t2 = derivatives[i, 2, k]
+        w0 = weight[k] * t0
+        w1 = weight[k] * t1
+        w2 = weight[k] * t2
+        b0 += residual[k] * w0
+        b1 += residual[k] * w1
+        b2 += residual[k] * w2
+        a00 += w0 * t0
+        a10 += w1 * t0
+        a11 += w1 * t1
+        a20 += w2 * t0
+        a21 += w2 * t1
+        a22 += w2 * t2
     gradient[a] += b0
     gradient[a + 1] += flux * b1
     gradient[a + 2] += flux * b2
+    matrix[a, a] += a00
+    matrix[a + 1, a] += flux * a10
+    matrix[a + 1, a + 1] += flux * flux * a11
+    matrix[a + 2, a] += flux * a20
+    matrix[a + 2, a + 1] += flux * flux * a21
+    matrix[a + 2, a + 2] += flux * flux * a22
 
 
 @sums
@@ -320,6 +347,17 @@ def _is_near(x, y, box, reach):
 
 # The equations.
 
+@apart
+def _add_star(flux, profile, model):
+    """Add a star to a model; return the sum of squares of its profile."""
+    squares = 0.0
+    for i in range(model.size):
+        g = profile[i]
+        model[i] += flux * g
+        squares += g * g
+    return squares
+
+
 @inner
 def _model_stars(parameters, n, own, box, psf, scratch, residual):
     """
@@ -334,16 +372,15 @@ def _model_stars(parameters, n, own, box, psf, scratch, residual):
         x, y = parameters[3 * s + 1], parameters[3 * s + 2]
         if s != own and not _is_near(x, y, box, scratch.sight[0]):
             continue
-        derivatives = scratch.derivatives[count, :, :residual.size]
+        # Not a slice of it: the compiler would not know that pixels are
+        # next to each other.
+        derivatives = scratch.derivatives[count]
         fill_derivatives(x, y, box, psf, scratch.tiling, derivatives)
-        flux = parameters[3 * s]
-        top = 0.0
-        for i in range(residual.size):
-            residual[i] += flux * derivatives[0, i]
-            top = max(top, abs(derivatives[0, i]))
-        if top > _UNSEEN:
+        seen = _add_star(parameters[3 * s], derivatives[0], residual)
+        if seen > _UNSEEN * _UNSEEN:
+            faint = scratch.sight[1]
             scratch.near[count] = s
-            scratch.joined[count] = s == own or top > scratch.sight[1]
+            scratch.joined[count] = s == own or seen > faint * faint
             count += 1
     return count
 
@@ -367,15 +404,15 @@ def _add_equations(parameters, scratch, count, weight, residual, new):
     for i in range(count):
         a = 3 * scratch.near[i]
         flux = parameters[a]
-        _add_gradient(scratch.derivatives, i, flux, weight, residual, a,
-                      new.gradient)
+        _add_own(scratch.derivatives, i, flux, weight, residual, a,
+                 new.gradient, new.matrix)
         if not scratch.joined[i]:
             continue
         if lowest < 0:
             lowest = a
         for k in range(a, a + 3):
             new.first[k] = min(new.first[k], lowest)
-        for j in range(i + 1):
+        for j in range(i):
             if scratch.joined[j]:
                 b = 3 * scratch.near[j]
                 _add_block(scratch.derivatives, i, flux, j, parameters[b],
@@ -414,7 +451,7 @@ def normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
         residual, weight = new.residuals[c, :used], new.weights[c, :used]
         count = _model_stars(parameters, n, c, pixels.boxes[c], psf, scratch,
                              residual)
-        _weigh(pixels.data[c, :used], pixels.variance[c, :used], sky,
+        _weigh(pixels.data[c, :used], pixels.weights[c, :used], sky,
                pixels.gain, old.weights[c, :used], residual, weight, chi2)
         _add_equations(parameters, scratch, count, weight, residual, new)
         if fit_sky:
@@ -423,6 +460,37 @@ def normal_equations(parameters, n, fit_sky, pixels, psf, scratch, old, new,
 
 
 # Single stars.
+
+@apart
+def _model_ahead(data, sky, step, flux, derivatives, residual):
+    """Turn residuals into the model of the star after a step (3,)."""
+    by_flux, by_x, by_y = step[0], flux * step[1], flux * step[2]
+    for k in range(residual.size):
+        residual[k] = data[k] - sky - residual[k] + (
+            by_flux * derivatives[0, k] + by_x * derivatives[1, k]
+            + by_y * derivatives[2, k])
+
+
+@inner
+def step_ahead(parameters, step, fit_sky, pixels, scratch, equations, chi2):
+    """
+    Find residuals and weights after a small step of a single star.
+
+    The derivatives in scratch must be those at parameters; chi2 is as of
+    `normal_equations`. The matrix stays as it is.
+    """
+    used = pixels.boxes[0, 2] * pixels.boxes[0, 3]
+    data, weight = pixels.data[0, :used], equations.weights[0, :used]
+    residual = equations.residuals[0, :used]
+    sky = parameters[3] if fit_sky else 0.0
+    _model_ahead(data, sky, step, parameters[0], scratch.derivatives[0],
+                 residual)
+    if fit_sky:
+        sky += step[3]
+    chi2[0] = chi2[1] = 0.0
+    _weigh(data, pixels.weights[0, :used], sky, pixels.gain, weight, residual,
+           weight, chi2)
+
 
 @kernel
 def star_derivatives(x_0, y_0, box, psf, tiling, out):

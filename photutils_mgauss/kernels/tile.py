@@ -1,15 +1,14 @@
 """The PSF of a star and its derivatives on a tile of pixels."""
-from math import exp, log, sqrt
-
-import numpy as np
+from math import log, sqrt
 
 from photutils_mgauss.kernels.gaussian import (
     NOTHING,
+    fast_exp,
     point_gradient,
     point_value,
 )
 from photutils_mgauss.kernels.grid import blend_weights
-from photutils_mgauss.kernels.jit import inner, loop
+from photutils_mgauss.kernels.jit import apart, inner
 from photutils_mgauss.kernels.linear import clear
 from photutils_mgauss.kernels.series import (
     LANES,
@@ -29,6 +28,8 @@ from photutils_mgauss.kernels.series import (
 
 # Numbers of which walks over a tile, and series of products, make use.
 _WALK = 4 * LANES
+# Of this many rows, and no more, only so many are walked over.
+_LOW = 12
 SCRATCH = _WALK + SERIES
 
 # The smallest share of a Gaussian in a blend, so that the slope of the share
@@ -36,65 +37,46 @@ SCRATCH = _WALK + SERIES
 _LEAST_SHARE = 1e-30
 
 
-@loop
-def _walk_starts(a, dx, dy, p, s, q, stride, by_x, by_y, height, walk):
-    """
-    Put what a walk along the columns starts from into walk (4, LANES) flat.
+def _walker(lanes):
+    """Return a function that walks over the first rows of a tile."""
+    @apart
+    def add_walk(a, dx, dy, p, s, q, fall, by_x, by_y, width, walk, tile):
+        """
+        Add a Gaussian to a tile, two multiplications a pixel.
 
-    For each row the Gaussian in the first column, its quotient with the next
-    one, and the factors of the Gaussian in its derivative by x and, short of
-    s times the former, by y. Rows from height on stay as they are. Returns
-    whether anything is there. The values of the first column are a Gaussian
-    in y, walked outward from its peak. stride is as of
-    `psf.rows.strides`.
-    """
-    t, grow, drop, _ = stride
-    u = dx
-    slope = q * dy - p * s * u
-    top = min(max(int(np.rint(-slope / t)), 0), height - 1)
-    u -= s * top
-    slope += t * top
-    first = a * exp(-0.5 * (p * u * u + q * (dy + top) ** 2))
-    if abs(first) < NOTHING:
-        return False
-    g = first
-    r = exp(-slope - 0.5 * t)
-    for j in range(top, height):
-        walk[j] = g
-        g *= r
-        r *= drop
-    g = first
-    r = exp(slope - 0.5 * t)
-    for j in range(top - 1, -1, -1):
-        g *= r
-        r *= drop
-        walk[j] = g
-    r = exp(-p * (dx + 0.5))
-    for j in range(height):
-        walk[LANES + j] = r
-        r *= grow
-    by_y += s * by_x
-    for j in range(height):
-        walk[2 * LANES + j] = p * (dx - s * j) + by_x
-        walk[3 * LANES + j] = q * (dy + j) + by_y
-    return True
+        walk (4 LANES,) holds for each row the Gaussian in a column, its
+        quotient with the next one, fall times that of the column before, and
+        the factors of the Gaussian in its derivative by x and, short of s
+        times the former, by y.
+        """
+        by_y += s * by_x
+        peak = 0.0
+        for j in range(lanes):
+            u, v = dx - s * j, dy + j
+            g = fast_exp(-0.5 * (p * u * u + q * v * v))
+            peak += g
+            walk[j] = a * g
+            walk[LANES + j] = fast_exp(-p * (u + 0.5))
+            walk[2 * LANES + j] = p * u + by_x
+            walk[3 * LANES + j] = q * v + by_y
+        if peak < NOTHING:
+            return
+        for i in range(width):
+            column = 3 * LANES * i
+            pi = p * i
+            for j in range(lanes):
+                g = walk[j]
+                r = walk[LANES + j]
+                h = (walk[2 * LANES + j] + pi) * g
+                tile[column + j] += g
+                tile[column + LANES + j] += h
+                tile[column + 2 * LANES + j] += walk[3 * LANES + j] * g - s * h
+                walk[j] = g * r
+                walk[LANES + j] = r * fall
+    return add_walk
 
 
-@loop
-def _add_walk(p, s, fall, width, walk, tile):
-    """Add a Gaussian to a tile, two multiplications a pixel."""
-    for i in range(width):
-        column = 3 * LANES * i
-        pi = p * i
-        for j in range(LANES):
-            g = walk[j]
-            r = walk[LANES + j]
-            h = (walk[2 * LANES + j] + pi) * g
-            tile[column + j] += g
-            tile[column + LANES + j] += h
-            tile[column + 2 * LANES + j] += walk[3 * LANES + j] * g - s * h
-            walk[j] = g * r
-            walk[LANES + j] = r * fall
+_add_walk, _add_low_walk = _walker(LANES), _walker(_LOW)
 
 
 @inner
@@ -162,9 +144,12 @@ def add_gaussian(a, dx, dy, p, s, q, stride, by_x, by_y, integrated, faint,
              or (left < 0 and p * left * left > 600))
     if steep:
         _add_points(a, dx, dy, p, s, q, by_x, by_y, None, height, width, tile)
-    elif _walk_starts(a, dx - s * dy, dy, p, s, q, stride, by_x, by_y, height,
-                      walk):
-        _add_walk(p, s, stride[3], width, walk, tile)
+    elif height <= _LOW:
+        _add_low_walk(a, dx - s * dy, dy, p, s, q, stride[3], by_x, by_y,
+                      width, walk, tile)
+    else:
+        _add_walk(a, dx - s * dy, dy, p, s, q, stride[3], by_x, by_y, width,
+                  walk, tile)
 
 
 @inner
@@ -196,7 +181,8 @@ def fill_derivatives(x_0, y_0, box, psf, tiling, out):
     """
     Put the unit-flux PSF in a box and its derivatives by x_0 and y_0.
 
-    They go into out (3, width * height), column after column. psf is (nodes,
+    They go into the first width * height numbers of the rows of out (3, n),
+    column after column. psf is (nodes,
     strides, x_grid, y_grid, integrated), tiling is scratch (walk, tile, index,
     weights). The change of the blend with position is included.
     """
@@ -207,8 +193,20 @@ def fill_derivatives(x_0, y_0, box, psf, tiling, out):
         rows = min(LANES, height - bottom)
         _fill_tile(x_0, y_0, row + bottom, column, rows, width, psf, tiling)
         for part in range(3):
-            for i in range(width):
-                k = (3 * i + part) * LANES
-                to = i * height + bottom
-                for j in range(rows):
-                    out[part, to + j] = tile[k + j]
+            _copy_part(tile[part * LANES:], bottom, rows, LANES, height,
+                       width, out[part])
+
+
+@apart
+def _copy_part(part, bottom, rows, lanes, height, width, out):
+    """Copy a part of a tile to the rows from bottom on of all columns."""
+    # Of a single tile whole runs of lanes are copied: what they put into the
+    # next column is written over there. A number that the compiler does not
+    # know keeps it from copying one by one, and slices tell it that no index
+    # counts from the end.
+    for i in range(width):
+        start = i * height + bottom
+        many = height <= lanes and start + lanes <= width * height
+        source, target = part[3 * LANES * i:], out[start:]
+        for j in range(lanes if many else rows):
+            target[j] = source[j]
