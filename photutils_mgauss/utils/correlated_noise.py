@@ -248,20 +248,17 @@ def _products(pulls):
     """Return the products of all pairs of pixels, and how many there are."""
     products, pairs = sums = no_pairs()
     good = np.isfinite(pulls)
-    values = np.where(good, pulls, 0)
-    good = good.astype(float)
-    height, width = values.shape
+    # Rows one after another, with zeros between them: pixels at the same
+    # distance are the same number of steps apart.
+    between = ((0, 0), (0, _REACH))
+    values = np.pad(np.where(good, pulls, 0), between).ravel()
+    good = np.pad(good.astype(float), between).ravel()
+    step = pulls.shape[1] + _REACH
     for dy in range(_REACH + 1):
         for dx in range(-_REACH if dy else 0, _REACH + 1):
-            if dy >= height or abs(dx) >= width:
-                continue
-            one = (slice(0, height - dy),
-                   slice(max(-dx, 0), width - max(dx, 0)))
-            other = (slice(dy, height),
-                     slice(max(dx, 0), width - max(-dx, 0)))
+            apart = min(dy * step + dx, values.size)
             for array, total in ((values, products), (good, pairs)):
-                found = np.vdot(array[one], array[other])
-                total[_REACH + dy, _REACH + dx] += found
-                if dy or dx:
-                    total[_REACH - dy, _REACH - dx] += found
+                found = np.dot(array[:array.size - apart], array[apart:])
+                total[_REACH + dy, _REACH + dx] = found
+                total[_REACH - dy, _REACH - dx] = found
     return sums
