@@ -22,3 +22,5 @@ figure, axes = plt.subplots(2, 2, figsize=(3.5, 4), layout='constrained')
 for row, name in zip(axes, ('weights', 'stddevs'), strict=True):
     plot_posterior(posterior, name, ax=row[0])
     plot_trace(posterior, name, ax=row[1])
+    # The colours are those of the histograms, whose legend tells them.
+    row[1].get_legend().remove()

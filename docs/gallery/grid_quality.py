@@ -41,7 +41,7 @@ epsfs = GriddedPSFModel(NDData(
 psfs = {k: GriddedMixturePSF.from_gridded_psf(epsfs, n_components=k)
         for k in (2, 3, 5)}
 
-figure, axes = plt.subplots(2, 3, figsize=(7.1, 3.4), layout='constrained')
+figure, axes = plt.subplots(2, 3, figsize=(7.1, 3.8), layout='constrained')
 maps, worst = axes
 plot_node_map(psfs[3], 'size_error', ax=maps[0])
 plot_node_map(psfs[3], 'phase_error', ax=maps[1])
@@ -51,7 +51,7 @@ for ax, (k, psf) in zip(worst, psfs.items(), strict=True):
     ax.set_title(f'K = {k}')
 maps[0].set_title('size')
 maps[1].set_title('pixel phase')
-bars = [ax for ax in figure.axes if ax not in axes]
+bars = [bar for ax in axes.flat for bar in ax.child_axes]
 for bar, label in zip(bars, (r'$\delta(R^2)/R^2$', 'shift [pix]',
                              *3 * ['% of the peak']), strict=True):
     bar.set_ylabel(label)

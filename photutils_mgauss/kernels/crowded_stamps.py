@@ -27,13 +27,13 @@ class Gaussians(NamedTuple):
     """
     The PSF of each of n stars, as Gaussians.
 
-    Star i's are the first count[i] of rows[i] (n, K, 6); strides (n, K, 4) is
-    as of `psf.rows.strides`, integrated whether pixels are integrated over,
-    None if not.
+    Star i's are the first count[i] of rows[i] (n, K, 6); falls (n, K) is as of
+    `psf.rows.falls`, integrated whether pixels are integrated over, None if
+    not.
     """
 
     rows: np.ndarray
-    strides: np.ndarray
+    falls: np.ndarray
     count: np.ndarray
     integrated: bool | None
 
@@ -76,7 +76,7 @@ def star_stamps(chosen, sources, stamps, gaussians, tiling):
     """
     x, y, _ = sources
     left, bottom, width, offset, derivatives = stamps
-    rows, strides, count, integrated = gaussians
+    rows, falls, count, integrated = gaussians
     walk, tile, _, _ = tiling
     for i in chosen:
         w = width[i]
@@ -89,7 +89,7 @@ def star_stamps(chosen, sources, stamps, gaussians, tiling):
                 a, mx, my, p, s, q = rows[i, k]
                 add_gaussian(a, left[i] - x[i] - mx,
                              bottom[i] + first - y[i] - my, p, s, q,
-                             strides[i, k], 0.0, 0.0, integrated, faint,
+                             falls[i, k], 0.0, 0.0, integrated, faint,
                              height, w, walk, tile)
             for j in range(height):
                 to = offset[i] + (first + j) * w

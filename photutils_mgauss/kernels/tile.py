@@ -125,14 +125,14 @@ def _add_over_pixels(a, dx, dy, p, s, q, by_x, by_y, faint, height, width,
 
 
 @inner
-def add_gaussian(a, dx, dy, p, s, q, stride, by_x, by_y, integrated, faint,
+def add_gaussian(a, dx, dy, p, s, q, fall, by_x, by_y, integrated, faint,
                  height, width, walk, tile):
     """
     Add a Gaussian, its first pixel at (dx, dy) from the peak, to a tile.
 
     a includes its share in the blend, whose relative slopes are by_x and
     by_y. What is less than faint may be left out of an integrated Gaussian.
-    walk (SCRATCH,) begins with zeros.
+    fall is as of `psf.rows.falls`. walk (SCRATCH,) begins with zeros.
     """
     if integrated is not None and integrated:
         _add_over_pixels(a, dx, dy, p, s, q, by_x, by_y, faint, height, width,
@@ -145,17 +145,17 @@ def add_gaussian(a, dx, dy, p, s, q, stride, by_x, by_y, integrated, faint,
     if steep:
         _add_points(a, dx, dy, p, s, q, by_x, by_y, None, height, width, tile)
     elif height <= _LOW:
-        _add_low_walk(a, dx - s * dy, dy, p, s, q, stride[3], by_x, by_y,
+        _add_low_walk(a, dx - s * dy, dy, p, s, q, fall, by_x, by_y,
                       width, walk, tile)
     else:
-        _add_walk(a, dx - s * dy, dy, p, s, q, stride[3], by_x, by_y, width,
+        _add_walk(a, dx - s * dy, dy, p, s, q, fall, by_x, by_y, width,
                   walk, tile)
 
 
 @inner
 def _fill_tile(x_0, y_0, row, column, height, width, psf, tiling):
     """Put the PSF and its derivatives in up to LANES rows into the tile."""
-    nodes, strides, _, _, integrated = psf
+    nodes, falls, _, _, integrated = psf
     walk, tile, index, weights = tiling
     clear(walk, _WALK)
     clear(tile, 3 * LANES * width)
@@ -172,7 +172,7 @@ def _fill_tile(x_0, y_0, row, column, height, width, psf, tiling):
             a, mx, my, p, s, q = nodes[index[corner], k]
             if a != 0:
                 add_gaussian(w * a, column - x_0 - mx, row - y_0 - my, p, s,
-                             q, strides[index[corner], k], wx / w, wy / w,
+                             q, falls[index[corner], k], wx / w, wy / w,
                              integrated, faint, height, width, walk, tile)
 
 
@@ -182,9 +182,9 @@ def fill_derivatives(x_0, y_0, box, psf, tiling, out):
     Put the unit-flux PSF in a box and its derivatives by x_0 and y_0.
 
     They go into the first width * height numbers of the rows of out (3, n),
-    column after column. psf is (nodes,
-    strides, x_grid, y_grid, integrated), tiling is scratch (walk, tile, index,
-    weights). The change of the blend with position is included.
+    column after column. psf is (nodes, falls, x_grid, y_grid, integrated),
+    tiling is scratch (walk, tile, index, weights). The change of the blend
+    with position is included.
     """
     _, tile, index, weights = tiling
     blend_weights(x_0, y_0, psf[2], psf[3], index, weights)

@@ -14,7 +14,7 @@ import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.base import PSFModel
-from photutils_mgauss.psf.rows import strides
+from photutils_mgauss.psf.rows import falls
 from photutils_mgauss.utils.parallel import Threads, map_parallel
 from photutils_mgauss.utils.waiting import progress
 
@@ -75,9 +75,9 @@ def psf_arrays(model):
 
     Returns
     -------
-    nodes, strides, x_grid, y_grid, integrated : tuple
+    nodes, falls, x_grid, y_grid, integrated : tuple
         The mixtures at the nodes (M, K, 6), what the kernels precompute of
-        them (M, K, 4), the axes of the grid, and whether they are integrated
+        them (M, K), the axes of the grid, and whether they are integrated
         over pixels (None if not: see `kernels.jit`).
     """
     if not isinstance(model, PSFModel):
@@ -87,7 +87,7 @@ def psf_arrays(model):
     grid = model.grid
     rows, x_grid, y_grid = (_as_kernels_take(a, np.float64)
                             for a in (grid.rows, grid.x_grid, grid.y_grid))
-    return (rows, strides(rows), x_grid, y_grid,
+    return (rows, falls(rows), x_grid, y_grid,
             model.pixel_integrated or None)
 
 

@@ -1,7 +1,11 @@
 """Figures of PSF fields."""
 import numpy as np
 
-from photutils_mgauss.plotting.style import VERMILION, current_axes
+from photutils_mgauss.plotting.style import (
+    VERMILION,
+    colour_bar,
+    current_axes,
+)
 from photutils_mgauss.psf.shapes import adaptive_moments
 from photutils_mgauss.utils.validation import as_choice, as_integer
 
@@ -66,7 +70,7 @@ def _plot_sizes(ax, x, y, shapes):
     ax.set_title('$R^2$ [pix$^2$]')
     shown = ax.pcolormesh(x, y, np.reshape(shapes.r2, (y.size, x.size)),
                           shading='nearest', cmap='viridis')
-    ax.figure.colorbar(shown, ax=ax)
+    colour_bar(ax, shown)
 
 
 def _plot_whiskers(ax, x, y, shapes):
@@ -103,5 +107,5 @@ def _plot_mean_residual(ax, field):
            ylabel='y [pix]')
     shown = ax.imshow(mean, origin='lower', cmap='RdBu', vmin=-limit,
                       vmax=limit, extent=[-half - 0.5, half + 0.5] * 2)
-    ax.figure.colorbar(shown, ax=ax)
+    colour_bar(ax, shown)
     return ax

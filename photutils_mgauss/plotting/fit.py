@@ -6,6 +6,7 @@ from photutils_mgauss.plotting.style import (
     BLUE,
     CYCLE,
     VERMILION,
+    colour_bar,
     current_axes,
 )
 from photutils_mgauss.utils.image import read_quantity
@@ -167,7 +168,7 @@ def plot_residual(fit, *, peak=None, limit=None, label=None, ax=None):
     """
     ax = current_axes(ax)
     shown = _draw_residual(ax, fit, peak, limit, label)
-    ax.figure.colorbar(shown, ax=ax, label='residual / peak')
+    colour_bar(ax, shown, 'residual / peak')
     return ax
 
 
@@ -281,7 +282,7 @@ def plot_mixture(mixture, *, radius=None, decades=4, pixel_integrated=False,
     shown = ax.imshow(
         np.log10(np.maximum(image / image.max(), 10.0 ** -decades)),
         origin='lower', cmap='cividis', extent=(-radius, radius) * 2)
-    ax.figure.colorbar(shown, ax=ax, label='log of value / peak')
+    colour_bar(ax, shown, 'log of value / peak')
     ax.set(xlabel='x [pix]', ylabel='y [pix]', aspect='equal')
     return ax
 

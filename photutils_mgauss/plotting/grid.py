@@ -3,7 +3,14 @@ import numpy as np
 from astropy.stats import mad_std
 
 from photutils_mgauss.plotting.fit import plot_mixture
-from photutils_mgauss.plotting.style import BLACK, BLUE, ORANGE, current_axes
+from photutils_mgauss.plotting.style import (
+    BLACK,
+    BLUE,
+    ORANGE,
+    colour_bar,
+    current_axes,
+    round_length,
+)
 from photutils_mgauss.psf.shapes import adaptive_moments
 
 __all__ = [
@@ -86,7 +93,7 @@ def plot_node_map(psf, column='size_error', *, layout=None, ax=None):
     points = ax.scatter(x, y, c=values, s=9, marker='s', cmap='cividis',
                         vmin=limits[0], vmax=limits[1], plotnonfinite=False)
     label = _NODE_LABELS.get(column, column)
-    ax.figure.colorbar(points, ax=ax, label=label)
+    colour_bar(ax, points, label)
     if good.size:
         ax.set_title(f'{label}: median {np.median(good):.2g}, '
                      f'scatter {mad_std(good):.2g}')
@@ -148,15 +155,13 @@ def plot_whiskers(psf, *, layout=None, scale=None, ax=None):
 
 def _draw_key(ax, scale, largest):
     """Draw a whisker of a round ellipticity above the Axes."""
-    decade = 10.0 ** np.floor(np.log10(max(largest, 1e-12)))
-    key = max(step * decade for step in (1, 2, 5)
-              if step == 1 or step * decade <= largest)
+    key = round_length(largest)
     # Across, in data; upwards, in fractions of the Axes.
     across = ax.get_xaxis_transform()
     left = ax.dataLim.x0
-    ax.plot([left, left + scale * key], [1.03, 1.03], color=BLUE,
+    ax.plot([left, left + scale * key], [1.06, 1.06], color=BLUE,
             transform=across, clip_on=False)
-    ax.annotate(f'  ellipticity {key:g}', (left + scale * key, 1.03),
+    ax.annotate(f'  ellipticity {key:g}', (left + scale * key, 1.06),
                 xycoords=across, va='center', annotation_clip=False)
 
 
@@ -213,7 +218,7 @@ def plot_worst_node(psf, source, column='size_error', *, ax=None):
     limit = np.abs(residual[2:-2, 2:-2]).max()
     picture = ax.imshow(residual, origin='lower', cmap='RdBu_r', vmin=-limit,
                         vmax=limit, extent=(x[0], x[-1], y[0], y[-1]))
-    ax.figure.colorbar(picture, ax=ax, label='residual [% of the peak]')
+    colour_bar(ax, picture, 'residual [% of the peak]')
     place = psf.grid_xypos[worst]
     ax.set(xlabel='x [pix]', ylabel='y [pix]', title=(
         f'node ({place[0]:.0f}, {place[1]:.0f}), '
@@ -254,7 +259,7 @@ def plot_width_map(psf, *, stars=None, ax=None):
     fwhm = np.atleast_1d(adaptive_moments(psf.mixtures).fwhm)
     x, y = psf.grid_xypos.T
     points = ax.scatter(x, y, c=fwhm, s=12, marker='s', cmap='cividis')
-    ax.figure.colorbar(points, ax=ax, label='FWHM [pix]')
+    colour_bar(ax, points, 'FWHM [pix]')
     if stars is not None and len(stars):
         ax.plot(*np.transpose(stars), 'o', color=ORANGE, fillstyle='none',
                 markersize=6)
@@ -398,7 +403,7 @@ def plot_shape_map(x, y, values, *, label, ax=None):
     ax.set(aspect='equal', xlabel='x [pix]', ylabel='y [pix]')
     ax.set_title(f'{label}: {np.nanmean(values):+.2e} '
                  f'$\\pm$ {np.nanstd(values):.1e}')
-    ax.figure.colorbar(shown, ax=ax, label=label)
+    colour_bar(ax, shown, label)
     return ax
 
 

@@ -7,6 +7,7 @@ from photutils_mgauss.plotting.style import (
     GREY,
     ORANGE,
     current_axes,
+    round_length,
 )
 
 __all__ = [
@@ -91,8 +92,7 @@ def plot_residual_vectors(solution, epoch, *, scale=None, title=None,
     ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal')
     ax.set_title(f'epoch {epoch}' if title is None else title, loc='left')
     ax.invert_xaxis()
-    ax.quiverkey(arrows, 0.85, 1.04, scale, f'{scale:.2g} {rows["dra"].unit}',
-                 labelpos='W', color=BLUE)
+    _draw_key(ax, arrows, scale, rows['dra'].unit)
     return ax
 
 
@@ -158,9 +158,15 @@ def plot_residual_map(residuals, chip='', *, n_cells=6, scale=None, ax=None):
                                       (places + size / 2).T]))
     ax.autoscale_view()
     ax.set_title(f'chip {chip}' if chip else '', loc='left')
-    ax.quiverkey(arrows, 0.85, 1.04, scale, f'{scale:.2g} pix', labelpos='W',
-                 color=BLUE)
+    _draw_key(ax, arrows, scale, 'pix')
     return ax
+
+
+def _draw_key(ax, arrows, scale, unit):
+    """Draw an arrow of a round length above the Axes."""
+    key = round_length(scale)
+    ax.quiverkey(arrows, 0.85, 1.04, key, f'{key:g} {unit}', labelpos='W',
+                 color=BLUE)
 
 
 def _cells(residuals, chip, n_cells):

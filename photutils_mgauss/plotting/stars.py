@@ -8,6 +8,7 @@ from photutils_mgauss.plotting.style import (
     CYCLE,
     ORANGE,
     VERMILION,
+    colour_bar,
     current_axes,
 )
 
@@ -150,7 +151,7 @@ def plot_residual_image(residual, error, *, limit=5, ax=None):
     shown = ax.imshow(np.asarray(residual) / np.asarray(error),
                       origin='lower', cmap='RdBu_r', vmin=-limit, vmax=limit,
                       interpolation='nearest')
-    ax.figure.colorbar(shown, ax=ax, label='residual / error')
+    colour_bar(ax, shown, 'residual / error')
     ax.set(xlabel='x [pix]', ylabel='y [pix]')
     return ax
 

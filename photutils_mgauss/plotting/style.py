@@ -3,9 +3,10 @@ The colours of all figures, and the Axes they are drawn on.
 
 The colours are those of Okabe and Ito, which the colour-blind can tell apart.
 """
+import numpy as np
 
 __all__ = ['BLACK', 'BLUE', 'CYCLE', 'GREY', 'ORANGE', 'VERMILION',
-           'current_axes']
+           'colour_bar', 'current_axes', 'round_length']
 
 BLACK, BLUE, ORANGE, VERMILION = '#000000', '#0072B2', '#E69F00', '#D55E00'
 GREY = '#9a9a9a'
@@ -18,3 +19,16 @@ def current_axes(ax):
         return ax
     import matplotlib.pyplot as plt
     return plt.gca()
+
+
+def colour_bar(ax, shown, label=''):
+    """Draw a colour bar beside Axes, as high as these."""
+    beside = ax.inset_axes((1.04, 0, 0.05, 1))
+    return ax.figure.colorbar(shown, cax=beside, label=label)
+
+
+def round_length(largest):
+    """Return the largest of 1, 2 and 5 times a power of ten up to a length."""
+    decade = 10.0 ** np.floor(np.log10(max(largest, 1e-12)))
+    return max(step * decade for step in (1, 2, 5)
+               if step == 1 or step * decade <= largest)

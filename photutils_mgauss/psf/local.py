@@ -12,7 +12,7 @@ import numpy as np
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.base import PSFModel
 from photutils_mgauss.psf.grid import cells, match
-from photutils_mgauss.psf.rows import kernel_rows, strides
+from photutils_mgauss.psf.rows import falls, kernel_rows
 
 MAX_WING = 60
 # A cell's families are merged if that changes no pixel by more than this
@@ -147,7 +147,7 @@ class LocalPSF:
     def gaussians_at(self, x, y):
         """Return the PSFs of stars at positions (n,) for the kernels."""
         rows, count = self.rows_at(x, y)
-        return kernels.Gaussians(rows, strides(rows), count, self.integrated)
+        return kernels.Gaussians(rows, falls(rows), count, self.integrated)
 
     def stamp(self, x, y, half):
         """Draw a star of unit flux in the middle of a stamp."""

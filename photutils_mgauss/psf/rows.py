@@ -39,19 +39,13 @@ def kernel_rows_of_logs(logs, sign=1.0):
     return rows
 
 
-def strides(rows):
+def falls(rows):
     """
-    Return the constant factors of walks over Gaussians, (..., K, 4).
+    Return by what factor the quotient of columns falls, (..., K).
 
-    The precision along y at fixed x; how the quotient of columns grows from
-    row to row; how the quotients of rows, and of columns, fall.
+    The quotient is that of a Gaussian in a column and in the one before.
     """
-    p, s, q = (rows[..., i] for i in (3, 4, 5))
-    along_y = q + s * s * p
-    # What overflows belongs to Gaussians that are too thin to be walked over.
-    with np.errstate(over='ignore'):
-        return np.stack([along_y, np.exp(p * s), np.exp(-along_y),
-                         np.exp(-p)], axis=-1)
+    return np.exp(-rows[..., 3])
 
 
 def log_rows(weights, means, covariances):
