@@ -51,7 +51,8 @@ def read_table(path):
                 table = QTable.read(path)
             except IORegistryError as error:
                 # Its own words are followed by all formats there are.
-                msg = 'a file of none of the kinds that it recognises'
+                msg = ('a file of none of the kinds that it recognises; '
+                       'images and PSFs are FITS or ASDF files')
                 raise OSError(msg) from error
         text = table.meta.get('MGRUN')
         record = (table.meta.get('mgauss', {}) if text is None

@@ -51,7 +51,8 @@ def test_info_says_that_a_text_is_none_of_the_files(folder, capsys):
     assert main(['info', 'notes.md']) == 1
     assert capsys.readouterr().err.strip() == (
         'mgauss: notes.md: must be a table that astropy can read, got a file '
-        'of none of the kinds that it recognises')
+        'of none of the kinds that it recognises; images and PSFs are FITS '
+        'or ASDF files')
 
 
 def test_without_a_command_there_is_help(capsys):
