@@ -27,10 +27,15 @@ def own_members(owner):
 
 
 def own_methods(owner):
-    """Yield name and function of the public methods that a class defines."""
+    """
+    Yield name and function of the public methods that a class defines.
+
+    Those of photutils that it wraps have photutils' documentation.
+    """
     for name, member in own_members(owner).items():
         function = getattr(member, '__func__', member)
-        if not name.startswith('_') and inspect.isfunction(function):
+        if (not name.startswith('_') and inspect.isfunction(function)
+                and function.__module__.startswith('photutils_mgauss.')):
             yield name, function
 
 
