@@ -122,7 +122,8 @@ class Run:
         """Keep what a table was made with and its cost, whatever its fate."""
         path = self.folder / NOTES
         notes = _read_notes(path)
-        notes[name] = note
+        # A run of another size that is stopped leaves these as they are.
+        notes[f'{self.settings.name} {name}'] = note
         path.write_text(json.dumps(notes, indent=0, sort_keys=True) + '\n')
 
     def notes(self):
