@@ -42,13 +42,13 @@ INDEX = """\
 Gallery
 =======
 
-Each figure is made by the script on its page, from nothing but simulations.
+This page shows all figures of the gallery. Click a figure to see the script
+that makes it from simulated data.
 
 .. container:: gallery
 
 {entries}
-Several scripts begin with the same simulations, which they import from
-``docs/gallery_scenes.py``:
+Several scripts import their simulations from ``docs/gallery_scenes.py``:
 
 .. literalinclude:: ../../gallery_scenes.py
    :language: python

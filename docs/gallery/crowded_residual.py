@@ -1,9 +1,8 @@
 """
-A crowded field, taken apart.
+Photometry of a crowded field.
 
-A simulated field with one star of 16 to 26 mag per 16 pixels, the stars that
-were found in it, and what is left when they are subtracted, in units of the
-error.
+A simulated field with one star of 16 to 26 mag per 16 pixels, the stars found
+in it, and the residual image in units of the error.
 """
 import matplotlib.pyplot as plt
 import numpy as np

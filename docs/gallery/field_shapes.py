@@ -1,8 +1,8 @@
 """
-A PSF made from stars, against the truth.
+Errors of a PSF made from stars.
 
-Size and ellipticity of a mixture field, fitted to the stars of one simulated
-image, minus those of the PSF the stars were drawn with.
+The size and ellipticity of a mixture field, fitted to the stars of one
+simulated image, minus those of the true PSF.
 """
 import matplotlib.pyplot as plt
 from gallery_scenes import star_image

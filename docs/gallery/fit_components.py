@@ -1,9 +1,9 @@
 """
 The Gaussians of a PSF.
 
-A PSF with Airy rings, three Gaussians fitted to it, and what they leave: the
-image summed along y (Fig. 3a of Nie et al.), its brightest row in logarithms
-(Fig. 3b), and the one-sigma ellipse of each Gaussian.
+A PSF with Airy rings, the three Gaussians fitted to it, and the residual: the
+image summed along y (Fig. 3a of Nie et al.), its brightest row on a
+logarithmic scale (Fig. 3b), and the one-sigma ellipse of each Gaussian.
 """
 import matplotlib.pyplot as plt
 import numpy as np

@@ -1,9 +1,9 @@
 """
-How many Gaussians.
+Residuals for different numbers of Gaussians.
 
 The residuals of fits with one to five Gaussians, on one scale, as in Appendix
-B of Nie et al., with the time of each fit. What it means for positions is the
-subject of :doc:`/tasks/how_many_gaussians`.
+B of Nie et al. :doc:`/tasks/how_many_gaussians` explains what they mean for
+positions.
 """
 import matplotlib.pyplot as plt
 import numpy as np

@@ -1,8 +1,8 @@
 """
 The posterior of a mixture.
 
-Draws of the weights and of the widths of two Gaussians, from PyMC, as in
-Appendix A of Nie et al.: histograms, and the two chains over each other.
+Draws of the weights and widths of two Gaussians, from PyMC, as in Appendix A
+of Nie et al.: histograms, and the traces of the two chains.
 """
 import matplotlib.pyplot as plt
 import numpy as np

@@ -1,12 +1,11 @@
 """
-How good a grid is.
+Errors of a grid.
 
-ePSFs with Airy rings, over a detector, turned into mixtures of three
-Gaussians: the error of the size at each node (as Figs. 4 to 7 of Nie et al.),
-the pixel-phase error, and the ellipticity as whiskers along the long axis.
-Below, for two, three and five Gaussians, what is left of the ePSF that is
-described worst: a pattern that one Gaussian could take up asks for more of
-them.
+Mixtures of three Gaussians fitted to a grid of ePSFs with Airy rings: the
+error of the size at each node (as Figs. 4 to 7 of Nie et al.), the pixel-phase
+error, and the ellipticity as whiskers along the long axis. The lower row shows
+the residual of the worst ePSF for two, three and five Gaussians. If one more
+Gaussian could describe the pattern, use more Gaussians.
 """
 import matplotlib.pyplot as plt
 import numpy as np

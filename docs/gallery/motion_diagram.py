@@ -2,7 +2,7 @@
 Proper motions.
 
 Stars and quasars of a simulated field at five epochs of Nie et al.: the
-diagram of their motions, and the measured motions beside the true ones.
+diagram of their motions, and the measured motions against the true ones.
 """
 import matplotlib.pyplot as plt
 import numpy as np

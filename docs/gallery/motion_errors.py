@@ -1,9 +1,8 @@
 """
-Errors of motions.
+Errors of proper motions.
 
-The errors of proper motions against magnitude, with all seven epochs of Nie
-et al. (as their Fig. 12), and their median for two to seven epochs (as Fig.
-11).
+The errors against magnitude with all seven epochs of Nie et al. (as their
+Fig. 12), and the median error for two to seven epochs (as Fig. 11).
 """
 import matplotlib.pyplot as plt
 import numpy as np

@@ -1,9 +1,9 @@
 """
-What an alignment leaves.
+Residuals of an alignment.
 
 The residuals of one of three epochs whose frames differ by rotation, scale
-and distortion, aligned with shifts alone and with polynomials of degree 3. An
-arrow in a pattern is distortion, arrows at random are noise.
+and distortion, aligned with shifts alone and with polynomials of degree 3.
+Arrows in a pattern show distortion; random arrows show noise.
 """
 import matplotlib.pyplot as plt
 

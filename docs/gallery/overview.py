@@ -1,8 +1,8 @@
 """
 From images to motions.
 
-A simulated image of stars, the PSF made of them, and the proper motions that
-two such images 3.6 years apart give.
+A simulated image of stars, the PSF made from these stars, and proper motions
+from two such images taken 3.6 years apart.
 """
 import matplotlib.pyplot as plt
 import numpy as np

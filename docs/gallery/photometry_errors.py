@@ -1,8 +1,8 @@
 """
 Errors of positions against magnitude.
 
-Stars of one simulated image, measured with the true PSF: how far positions
-are from the truth, and what the fit says of it (as Figs. 9 and 10 of Nie et
+Stars of one simulated image, measured with the true PSF: the true errors of
+their positions and the stated errors of the fit (as Figs. 9 and 10 of Nie et
 al.).
 """
 import matplotlib.pyplot as plt

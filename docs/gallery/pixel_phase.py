@@ -1,9 +1,9 @@
 """
 Pixel-phase errors.
 
-The same bright stars at all positions within a pixel, measured with the true
-PSF and with a single Gaussian. Where the PSF is wrong, the position depends
-on where in its pixel a star lies.
+Bright stars at all positions within a pixel, measured with the true PSF and
+with a single Gaussian. If the PSF is wrong, the measured position depends on
+where in its pixel the star lies.
 """
 import matplotlib.pyplot as plt
 import numpy as np
