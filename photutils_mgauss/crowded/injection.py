@@ -29,7 +29,7 @@ _MOST_PHOTONS = 1e15
 @dataclass(frozen=True)
 class InjectionResult:
     """
-    What became of artificial stars.
+    The results of a test with artificial stars.
 
     Attributes
     ----------
@@ -40,10 +40,11 @@ class InjectionResult:
         ``flags`` of its counterpart, NaN where there is none.
     curves : `~astropy.table.QTable`
         One row for each bin of true flux: ``flux_min``, ``flux_max``,
-        ``n_injected``, ``completeness``, and of the stars recovered the
-        robust scatter of position ``position_scatter`` [pix], of relative
-        flux ``flux_scatter``, its median ``flux_bias``, and the scatter of
-        position errors over the reported ones, ``position_pull``.
+        ``n_injected``, ``completeness``, and for the recovered stars the
+        robust scatter of positions ``position_scatter`` [pix] and of
+        relative fluxes ``flux_scatter``, the median relative error of
+        fluxes ``flux_bias``, and the scatter of positions divided by the
+        stated errors, ``position_pull``.
 
     Examples
     --------
@@ -64,36 +65,37 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
                        flux_edges=None, effective_gain=1.0, repeats=1,
                        rng=None):
     """
-    Add artificial stars to an image and see what is found of them.
+    Add artificial stars to an image and test how well they are measured.
 
-    The stars are drawn with the PSF of ``photometry``, with the noise of
-    their own light, on a jittered lattice so wide that they do not crowd one
-    another, and the image is reduced again as before.
+    The function draws the stars with the PSF of ``photometry`` and with
+    the noise of their own light, on a jittered lattice that is wide enough
+    to keep them apart. Then ``photometry`` measures the image again.
 
     Parameters
     ----------
     photometry : CrowdedMixturePhotometry
-        How the image is reduced.
+        The photometry to test.
     data : (ny, nx) array_like or NDData
         The image. Its own mask counts, its unit comes back: see
         :ref:`pixels`.
     flux : (n,) array_like or (low, high) tuple of float
-        The fluxes of the stars of one repeat, or limits between which they
-        are drawn evenly in the logarithm, as many as there is room for.
+        The fluxes of the stars of one repeat, or two limits between which
+        the logarithms of the fluxes are drawn evenly, for as many stars as
+        there is room for.
     mask, error
         As in `CrowdedMixturePhotometry.__call__`.
     separation : float, optional
         The distance of artificial stars [pix].
     radius : float, optional
-        How far from its place a star may be found [pix].
+        The largest distance at which a star counts as found [pix].
     flux_ratio : float, optional
-        By which factor its flux may be off.
+        The largest factor between true and measured flux.
     flux_edges : (m + 1,) array_like, optional
         The edges of the bins of flux; by default about a magnitude wide.
     effective_gain : float, optional
         Electrons per unit of data, for the noise of the artificial stars.
     repeats : int, optional
-        How often to do it.
+        The number of repeats.
     rng : `~numpy.random.Generator` or int, optional
         Randomness, or a seed.
 
@@ -105,7 +107,8 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     Raises
     ------
     TypeError, ValueError
-        If an argument is not valid, or if more stars are given than fit.
+        If an argument is not valid, or if there are more stars than
+        places.
 
     Examples
     --------

@@ -21,11 +21,11 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
     """
     Fit the PSF of a crowded image and its stars in turns.
 
-    A round PSF of the least blended bright stars finds all bright stars of
-    the image; what is left when all but the best of them are subtracted
-    tells a better PSF, which finds fainter stars. From pass to pass the
-    search goes deeper and the PSF varies more over the image, until it
-    changes no more.
+    The first PSF is round and fitted to the least blended bright stars.
+    With it the function finds all bright stars of the image. It subtracts
+    all but the best of them, fits a better PSF to these, and finds fainter
+    stars. In each pass the search goes deeper and the PSF may vary more
+    over the image, until it no longer changes.
 
     Of images larger than 1536 pixels, five windows of 320 pixels along each
     long axis are used.
@@ -41,24 +41,23 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
     mask : (ny, nx) array_like of bool, optional
         True for pixels to leave out, as those of saturated stars.
     stars : `~astropy.table.Table`, optional
-        Positions ``x`` and ``y`` of the only stars that the PSF may be
-        measured from; by default any. Those that are not ``selected``, if
-        there is such a column, do not count.
+        Positions ``x`` and ``y`` of the stars that may be used for the
+        PSF; by default all stars. If there is a column ``selected``, only
+        the selected stars count.
     n_components : int, optional
         The number K of Gaussians.
     degree : int or 'auto', optional
         The degree of the polynomials of the last pass, 0 for a PSF that is
-        the same everywhere. 'auto' is as high as there are forty stars for
-        each term, at most 4: 2 with 300 stars, 3 with 400. Terms that the
-        stars do not ask for are shrunk.
+        the same everywhere. 'auto' is the highest degree with at least
+        forty stars for each term, at most 4: 2 with 300 stars, 3 with 400.
+        Terms that are not significant are shrunk.
     radius : float, optional
-        The radius of the circle of pixels around each star that is fitted
-        [pix].
+        The radius of the circle of fitted pixels around each star [pix].
     max_stars : int, optional
-        How many stars the PSF is measured from at most, spread over the
+        The largest number of stars to use for the PSF, spread over the
         image.
     min_snr : float, optional
-        The least ratio of a star's flux to its error.
+        The smallest ratio of a star's flux to its error.
     saturation : float, optional
         Pixels at or above this value are left out.
     effective_gain : float, optional
@@ -69,10 +68,10 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
         The largest number of passes. A warning says if the PSF still
         changes after them.
     executor : `~concurrent.futures.Executor`, optional
-        Where stars are looked for; by default a pool of threads.
+        The executor that searches for stars; by default a pool of threads.
     checkpoint : str or path-like, optional
-        A folder in which finished searches are kept. A call with the same
-        image and settings takes them from there.
+        A folder for finished searches. A call with the same image and
+        settings uses the searches in it.
     progress_bar : bool, optional
         Whether to show a bar of the passes, with the number of stars and
         the change of the PSF.
@@ -80,19 +79,19 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
     Returns
     -------
     MixtureField
-        Its ``stars`` are those the PSF was measured from, its ``dropped``
-        the other bright ones with their ``x``, ``y``, ``flux``, ``snr``,
+        Its ``stars`` are those used for the PSF; its ``dropped`` lists the
+        other bright stars with their ``x``, ``y``, ``flux``, ``snr``,
         ``crowding`` and the ``reason``: 'edge'; 'masked', near bad pixels;
         'faint'; 'extended'; 'blended', more than half of the light in its
-        pixels is that of others; 'surplus', there are better ones nearby;
-        'deviant', unlike the others. ``to_grid`` makes it a PSF for
-        `CrowdedMixturePhotometry`.
+        pixels belongs to other stars; 'surplus', there are better stars
+        nearby; 'deviant', different from the other stars. ``to_grid``
+        converts the field to a PSF for `CrowdedMixturePhotometry`.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not valid, or fewer than five stars are good for a
-        PSF.
+        If an argument is not valid, or fewer than five stars are suitable
+        for a PSF.
 
     Examples
     --------

@@ -62,116 +62,118 @@ class CrowdedMixturePhotometry:
     r"""
     PSF photometry of crowded fields.
 
-    Stars are looked for on the residual, brightest first, and beside known
-    stars with these free to readjust; all stars and a smooth background are
-    fitted together,
+    The class searches the residual for stars, the brightest first, and for
+    companions of known stars with these free to readjust. It fits all stars
+    and a smooth background together, that is, it minimises
 
     .. math::
 
         \chi^2 = \sum_{\mathrm{pix}} \frac{1}{\sigma^2} \Big[D - b -
         \sum_i f_i\,P(\mathbf{r} - \mathbf{r}_i)\Big]^2,
 
-    by Gauss-Newton steps for all parameters at once; what has become
-    insignificant is left out; and so on until nothing significant is left.
+    with Gauss-Newton steps for all parameters at once. It removes stars that
+    are no longer significant, and repeats these steps until it finds no more
+    significant stars.
 
     Parameters
     ----------
     psf_model : GriddedMixturePSF, MultiGaussianPSFModel or None
-        The PSF. With None each image is measured with the PSF that
-        `fit_crowded_psf` makes of its own stars.
+        The PSF. With None, `fit_crowded_psf` makes the PSF of each image from
+        its own stars.
     threshold : float, optional
-        The significance from which a star is added, in standard errors of
-        its flux.
+        The smallest significance for adding a star, in standard errors of its
+        flux.
     keep : float, optional
-        Found stars whose flux, with their neighbours free, has fewer
-        standard errors than this are left out again.
+        The smallest significance for keeping a star, in standard errors of its
+        flux with its neighbours free.
     depth : float, optional
-        Stars down to this significance, if it is below ``threshold``, are
-        fitted along with the others for the sake of these. They are not
-        reported.
+        If this is below ``threshold``, the fit includes stars down to this
+        significance, which improves the results of the others. The table does
+        not list them.
     count_slope : float, optional
-        The prior of the flux of a found star: the number of stars per unit
-        flux falls with this power of the flux. Fluxes of bright stars stay
-        the same; where two stars share light, the fainter one gets less of
-        it. 0 is no prior.
+        The prior of the flux of a star that the search found: the number of
+        stars per unit flux falls with this power of the flux. Fluxes of bright
+        stars stay the same; if two stars share light, the fainter one gets
+        less of it. 0 means no prior.
     background_size : float or None, optional
         The distance of the nodes of the bilinear background [pix], or None
         if there is no background to fit.
     psf_error : float, optional
-        How well the PSF is known, as a fraction: residuals of bright stars
-        below it are not taken for stars.
+        The uncertainty of the PSF, as a fraction: smaller residuals of bright
+        stars do not count as stars.
     effective_gain : float, optional
         Electrons per unit of the data. With it the photon noise in ``error``
-        is replaced by that of the model, which avoids a bias of faint
-        fluxes. By default it is found out from ``data`` and ``error``;
-        infinity leaves the error as it is.
+        is replaced by that of the model, which avoids a bias of faint fluxes.
+        By default it is determined from ``data`` and ``error``; infinity
+        leaves the errors unchanged.
     maxiters : int, optional
         The largest number of searches at the final threshold.
     tile_shape : int or (ny, nx) tuple of int, optional
-        The image is solved in even tiles of at most this many pixels; by
+        The largest size of the equal tiles into which the image is divided; by
         default half of its longer side, but at least 1024 and at most 2048.
-        Smaller tiles need less memory, spread over more workers, and cost
-        more.
+        Smaller tiles need less memory and use more workers, but cost more.
     overlap : int, optional
-        How far a tile sees beyond its borders [pix], at least; with less
-        than two nodes of the background the result depends on the tiles.
+        The smallest margin of a tile beyond its borders [pix]; with less than
+        two nodes of the background the result depends on the tiles.
     executor : `~concurrent.futures.Executor`, optional
-        Where tiles are solved; by default a pool of threads on all cores.
+        The executor that solves tiles; by default a pool of threads on all
+        cores.
     progress_bar : bool, optional
         Whether to show a bar with the stars found and their chi2.
     checkpoint : str or path-like, optional
-        A folder in which finished tiles are kept. A call with the same image
-        and settings takes them from there, whatever ended the first one.
+        A folder for finished tiles. A call with the same image and settings
+        uses the tiles in it, for example after an interrupt.
     psf_errors : bool, optional
-        Whether the errors contain what the PSF may be off, if ``psf_model``
-        knows that, as the grid of a `MixtureField` does; see
-        `MixturePSFPhotometry`. Each star is taken by itself for this.
+        Whether the errors include the errors of the PSF, if ``psf_model`` has
+        them, as the grid of a `MixtureField` does; see `MixturePSFPhotometry`.
+        For this each star is treated as isolated.
     confusion : bool, optional
         Whether errors and fluxes allow for stars that are too faint or too
-        close to others to be found, in the number that the stars around tell.
-        Not where ``find_neighbors`` is False: then a list has all stars.
+        close to others to be found. Their number follows from the detected
+        stars around. Not used if ``find_neighbors`` is False, because the list
+        then has all stars.
     correlated_noise : bool, optional
-        Whether to look, where the light of stars is faint, if the noise of
-        neighbouring pixels is correlated, as in resampled images. If so, a
-        warning and ``meta['noise_correlation']`` of the table tell it,
-        errors are enlarged for it, and stars are looked for again, in twice
-        the time, with ``threshold``, ``keep`` and ``depth`` in units of these
+        Whether to measure, where the light of stars is faint, if the noise of
+        neighbouring pixels is correlated, as in resampled images. If it is, a
+        warning and ``meta['noise_correlation']`` of the table say so, the
+        errors are increased, and the search is repeated, which doubles the
+        time, with ``threshold``, ``keep`` and ``depth`` in units of these
         errors. Only used with ``error``.
     saturation : float or `~astropy.units.Quantity`, optional
-        The level from which pixels are saturated, in the unit of the data.
-        If given, such pixels are masked, with the trails along rows and
-        columns that their charge has run into and a pixel around them. Stars
-        behind masked pixels are fitted to their wings in any case.
+        The level at which pixels saturate, in the unit of the data. If given,
+        these pixels, the trails of their charge along rows and columns, and a
+        margin of one pixel are masked. Stars with masked centres are fitted to
+        their wings in any case.
     residual_radius : float, optional
-        If given, spikes, rings and ghosts of bright stars that the PSF does
-        not have are measured on the image, out to this distance [pix] and
-        fading beyond it, as `MixturePSFPhotometry` does it: what is left of
-        bright stars once all stars are fitted. It is taken off all of them
-        and the image solved again, in twice the time. A warning says if
-        there are too few stars. Not in `fit_images`.
+        If given, spikes, rings and ghosts of bright stars that the PSF lacks
+        are measured on the image, out to this distance [pix] and fading beyond
+        it, as by `MixturePSFPhotometry`. They are the mean residual of bright
+        stars after the fit of all stars. They are subtracted from all of these
+        stars and the image is solved again, which doubles the time. A warning
+        says if there are too few stars. Not available in `fit_images`.
     find_neighbors : bool, optional
-        Whether stars that are missing from a given list are found and fitted
-        together with those on it. They are not reported. Otherwise the list
-        has to be complete.
+        Whether to find stars that are missing from a given list and fit them
+        together with it. The table does not list them. If False, the list has
+        to be complete.
     xy_bounds : float or None, optional
-        How far, along each axis, a star of a given list may be from its
+        The largest shift, along each axis, of a star of a given list from its
         place [pix].
     **elsewhere
-        Of keywords that only photutils has an error says what replaces them.
+        For a keyword that only photutils has, the error says what replaces it.
 
     Attributes
     ----------
     results : `~astropy.table.QTable`
-        The last table; where several threads call the object, that of this
-        thread.
+        The last table; if several threads call the object, the last table of
+        this thread.
     field : MixtureField or None
-        The PSF that was made of the stars of the last image, if
-        ``psf_model`` is None.
+        The PSF made from the stars of the last image, if ``psf_model`` is
+        None.
     psf_residual : PSFResidual or None
-        What the PSF leaves of bright stars, if it was measured in the last
-        call; its ``image(x, y, flux)`` draws that of some stars.
+        The mean residual of bright stars, if the last call measured it; its
+        ``image(x, y, flux)`` draws it for given stars.
     psf_used : GriddedMixturePSF or MultiGaussianPSFModel
-        The PSF of the last table, ``psf_model`` unless that is None.
+        The PSF used for the last table, ``psf_model`` unless that is None.
 
     Raises
     ------
@@ -180,22 +182,22 @@ class CrowdedMixturePhotometry:
 
     Notes
     -----
-    Columns beside photutils' own: ``xy_cov``, the covariance of x and y
-    [pix^2]; ``x_psf_err``, ``y_psf_err`` and ``flux_psf_err``, the part of the
-    errors that is due to the PSF, if it is known; ``x_confusion_err``,
-    ``y_confusion_err`` and ``flux_confusion_err``, that of stars that were not
-    found, and ``flux_confusion``, what of their light has been taken off
-    ``flux_fit``; ``significance`` of the
-    detection; ``crowding``, the star's share of the light of all stars in its
-    fit pixels; ``neighbor_distance`` [pix] and ``neighbor_correlation``, the
-    correlation with the nearest neighbour's flux; ``iter_detected``. Bits of
-    ``flags`` beside photutils' own: 65536, most of the star is masked, as of
-    saturated ones; 131072, a blend, the correlation is beyond 0.5; 262144, not
-    a star: part of something extended, or something else is under it. Of a
-    given list, also: 524288, no significant star is here, its flux has fewer
-    than ``keep`` standard errors; 1048576, a repeat: another entry means the
-    same star, whose row this one shows again. With motions, also: 2097152,
-    the images that show the star do not tell its motion, which is NaN.
+    Columns in addition to photutils' own: ``xy_cov``, the covariance of x and
+    y [pix^2]; ``x_psf_err``, ``y_psf_err`` and ``flux_psf_err``, the part of
+    the errors that is due to the PSF, if it is known; ``x_confusion_err``,
+    ``y_confusion_err`` and ``flux_confusion_err``, the part due to undetected
+    stars, and ``flux_confusion``, the light of these stars that was subtracted
+    from ``flux_fit``; ``significance`` of the detection; ``crowding``, the
+    star's share of the light of all stars in its fit pixels;
+    ``neighbor_distance`` [pix] and ``neighbor_correlation``, the correlation
+    with the nearest neighbour's flux; ``iter_detected``. Bits of ``flags`` in
+    addition to photutils' own: 65536, most of the star is masked, as for
+    saturated stars; 131072, a blend: the correlation exceeds 0.5; 262144,
+    probably not a star but part of an extended source, or with another source
+    under it. With a given list, also: 524288, no significant star is here: its
+    flux has fewer than ``keep`` standard errors; 1048576, a repeat: another
+    entry is the same star, and this row repeats its row. With motions, also:
+    2097152, the images do not determine the motion of the star, which is NaN.
 
     Examples
     --------
@@ -300,8 +302,8 @@ class CrowdedMixturePhotometry:
             default it is estimated, one number for the image.
         init_params : `~astropy.table.Table`, optional
             Positions ``x_init``, ``y_init`` (or ``x``, ``y``, ...) and, if
-            known, ``flux_init`` of the stars to report. None is added, none
-            left out, and the result has their order.
+            known, ``flux_init`` of the stars to list. The result has exactly
+            these stars, in the same order.
 
         Returns
         -------
@@ -358,33 +360,34 @@ class CrowdedMixturePhotometry:
         Find and fit the stars of one field in many images together.
 
         The images may be shifted, rotated, of other filters, depths and PSFs.
-        There is one list of stars, found in the evidence of all images, with
-        places in common and a flux for each image, whether or not the star
-        is significant there.
+        The search combines all images. The result is one list of stars with
+        common positions and a flux for each image, also for images in which
+        the star is not significant.
 
         Parameters
         ----------
         images : sequence of (data, psf, wcs) or `ImageEpoch`
-            As for `fit_many`, with the sky left in. Where ``psf`` is None it
-            is ``psf_model`` or, without one, made of the image's own stars.
+            As for `fit_many`, but with the sky not subtracted. If ``psf`` is
+            None, the PSF is ``psf_model`` or, if that is None too, it is made
+            from the image's own stars.
         stars : `~astropy.table.Table` or SkyCoord, optional
-            The stars to report, with ``ra`` and ``dec`` [deg]. None is added,
-            none left out, and the result has their order.
+            The stars to list, with ``ra`` and ``dec`` [deg]. The result has
+            exactly these stars, in the same order.
         motions : bool, optional
-            Whether each star has a proper motion of its own; for
-            `ImageEpoch`, whose ``band`` tells filters apart.
+            Whether each star has its own proper motion; needs `ImageEpoch`,
+            whose ``band`` distinguishes filters.
 
         Returns
         -------
         `~astropy.table.QTable`
             ``id``, ``ra``, ``dec`` [deg], ``ra_error``, ``dec_error`` [mas],
-            ``radec_cov`` [mas^2] and, with motions, ``pmra``, ``pmdec``
-            [mas / yr] with errors; for each of E images ``x_fit``, ``y_fit``
-            [pix], ``flux``, ``flux_err``, ``local_bkg``, ``n_pixels_fit``,
-            ``image_chi2`` and ``crowding``, (n, E), NaN where an image does
-            not show the star; ``n_images`` that do, and for all of them
-            ``significance``, ``reduced_chi2``, ``flags`` and what is said of
-            neighbours.
+            ``radec_cov`` [mas^2] and, with motions, ``pmra``, ``pmdec`` [mas /
+            yr] with errors; for each of E images ``x_fit``, ``y_fit`` [pix],
+            ``flux``, ``flux_err``, ``local_bkg``, ``n_pixels_fit``,
+            ``image_chi2`` and ``crowding``, (n, E), NaN if an image does not
+            show the star; ``n_images``, the number of images that do, and for
+            all of them together ``significance``, ``reduced_chi2``, ``flags``
+            and the columns about neighbours.
 
         Raises
         ------
@@ -542,7 +545,8 @@ class CrowdedMixturePhotometry:
         shape : (ny, nx) tuple of int
             The shape of the image.
         psf_shape : int or (ny, nx) tuple of int, optional
-            How much of each star is drawn; by default all that can be seen.
+            The size of the stamp drawn for each star; by default as far as its
+            light is visible.
         include_local_bkg : bool, optional
             Whether to add the background, as interpolated from the nearest
             star.

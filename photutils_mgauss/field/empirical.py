@@ -93,9 +93,9 @@ class EmpiricalPSF(ComparedByValue):
         """
         Measure the PSF from the stars of one or more exposures.
 
-        Positions and fluxes of the stars are those of a mixture field fitted
-        first; deviant stars and pixels are left out as there. The example
-        above makes one.
+        The method first fits a mixture field, which gives positions and
+        fluxes of the stars and rejects deviant stars and pixels. See the
+        example above.
 
         Parameters
         ----------
@@ -110,7 +110,7 @@ class EmpiricalPSF(ComparedByValue):
         n_components : int, optional
             The number of Gaussians of the smooth part.
         executor : `~concurrent.futures.Executor`, optional
-            Where stars are worked on; by default a pool of threads.
+            The executor that works on stars; by default a pool of threads.
 
         Returns
         -------

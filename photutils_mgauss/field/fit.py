@@ -70,14 +70,14 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
     """
     Fit a PSF field to the pixels of stars.
 
-    The parameters of ``n_components`` Gaussians, as polynomials of detector
-    position, are fitted by maximum likelihood to the pixels of all stars,
-    together with the position and flux of each. Neighbours inside a star's
-    stamp are fitted along. Deviant stars and pixels are dropped.
+    The function fits ``n_components`` Gaussians, whose parameters are
+    polynomials of detector position, by maximum likelihood to the pixels
+    of all stars, together with the position and flux of each star and of
+    neighbours inside its stamp. It rejects deviant stars and pixels.
 
-    Several exposures of one detector share a field if lists are given for
-    ``data``, ``stars``, ``error`` and ``mask``; the PSF of each exposure is
-    the field convolved with a Gaussian of its own.
+    If you give lists for ``data``, ``stars``, ``error`` and ``mask``,
+    several exposures of one detector share a field; the PSF of each
+    exposure is the field convolved with its own Gaussian.
 
     Parameters
     ----------
@@ -85,8 +85,8 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         The image, its background subtracted. Its own mask counts, its unit
         comes back: see :ref:`pixels`.
     stars : `~astropy.table.Table` or list of those
-        The stars: ``x``, ``y`` and, if known, ``flux``; photutils' names with
-        ``_fit``, ``_init`` or ``_centroid`` are understood. If it has a
+        The stars: ``x``, ``y`` and, if known, ``flux``; photutils' names
+        with ``_fit``, ``_init`` or ``_centroid`` are accepted. If it has a
         column ``selected``, as tables of `select_psf_stars` do, the PSF is
         fitted to those stars and the others count as neighbours.
     error : float or (ny, nx) array_like, or list of those, optional
@@ -97,90 +97,92 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         too; pixels that are not finite, or whose error is not positive, are
         left out as well.
     n_components : int or 'auto', optional
-        The number K of Gaussians; 'auto' climbs between 2 and 7 to the number
-        that describes stars left out of the fit best. By default it is 6, or
-        'auto' with 8 to 59 stars.
+        The number K of Gaussians; 'auto' chooses the number from 2 to 7
+        that best describes stars left out of the fit. By default it is 6,
+        or 'auto' with 8 to 59 stars.
     degree : int or 'auto', optional
         The degree of the polynomials, 0 for a PSF that is the same
         everywhere; by default 4, or 'auto' with 8 to 59 stars, or 1 with
-        ``start``. It is lowered, with a warning, if there are too few stars.
-        'auto' tries degrees from 0 to 5 in the same way; fewer than 60 stars
-        have one degree more, its terms as small as the stars ask for, where
-        left-out stars gain by it. Terms that the stars
-        do not ask for are shrunk, so that a degree that is too high costs
-        time more than accuracy.
+        ``start``. It is lowered, with a warning, if there are too few
+        stars. 'auto' chooses a degree from 0 to 5 in the same way; with
+        fewer than 60 stars it adds terms of one degree more, with a prior
+        about zero, if they describe left-out stars better. Terms that are
+        not significant are shrunk, so that a degree that is too high takes
+        more time but loses little accuracy.
     radius : float, optional
-        The radius of the circle of pixels that is fitted [pix]. By default
-        four times the width at half maximum of the stars, but at least 10
-        and at most 20.
+        The radius of the circle of fitted pixels [pix]. By default four
+        times the width at half maximum of the stars, but at least 10 and
+        at most 20.
     local_bkg : bool, optional
         Whether to fit a constant background to each star's stamp.
     effective_gain : float, optional
-        Electrons per unit of ``data``. Where the error of a pixel contains
-        the noise of its own light, as `photutils.utils.calc_total_error`
-        makes it, that part is replaced by the expected noise of the model,
-        which removes a bias of faint fluxes. By default this is found out
-        from ``data`` and ``error``; infinity leaves the error as it is.
+        Electrons per unit of ``data``. If the error of a pixel includes
+        the noise of its own light, as from
+        `photutils.utils.calc_total_error`, the fit replaces this part by
+        the expected noise of the model, which removes a bias of faint
+        fluxes. By default the gain is determined from ``data`` and
+        ``error``; infinity leaves the errors unchanged.
     reject : bool, optional
         Whether to drop deviant stars and pixels.
     regularization : float, optional
-        The strength of the prior on the shapes. It keeps Gaussians apart that
-        the stars cannot tell from each other. How much the shapes vary over
-        the field is learnt from the stars. By default 1, or, where few stars
-        choose the number of Gaussians, 1, 4 or 16 as they choose.
+        The strength of the prior on the shapes. The prior keeps Gaussians
+        apart that the stars cannot distinguish. The stars determine how
+        much the shapes vary over the field. By default 1; if few stars
+        choose the number of Gaussians, they also choose between 1, 4 and
+        16.
     start : GriddedMixturePSF, optional
-        A PSF that is known already, as from an archive, or anything with a
-        method ``mixture_at``. Only what the stars can tell of it is fitted:
-        a Gaussian that it is convolved with, and a change of its wings and
-        of its asymmetry, polynomials of position; ``n_components`` does not
-        count then. Fifteen stars are enough.
+        A known PSF, for example from an archive, or any object with a
+        method ``mixture_at``. The fit then only adjusts it: it convolves
+        it with a Gaussian and changes its wings and its asymmetry, with
+        polynomials of position; ``n_components`` has no effect. Fifteen
+        stars are enough.
     centre : {'core', 'flux', 'catalogue'}, optional
-        What is at the origin of the PSF, which is where positions of stars
-        are: the point about which the first moment vanishes under a Gaussian
-        weight larger than the core of the PSF, its standard deviation twice
-        the full width at half maximum in the middle of the detector, if the
-        stamps are large enough for that; or the flux centroid, which wanders
-        from image to image with the noise of the wings; or, with
-        ``contexts``, what 'core' is for the mean star, from which those of
-        other colours are moved as the positions in ``stars`` ask for. They
-        must know nothing of colour then, as those of a catalogue. With
-        ``start`` it stays where that of ``start`` is.
+        The origin of the PSF, which defines the positions of stars. 'core'
+        is the point about which the first moment vanishes under a Gaussian
+        weight whose standard deviation is twice the full width at half
+        maximum in the middle of the detector, if the stamps are large
+        enough. 'flux' is the flux centroid, which changes from image to
+        image with the noise of the wings. 'catalogue', with ``contexts``,
+        is 'core' for the mean star; stars of other colours are shifted to
+        agree with the positions in ``stars``, which must not depend on
+        colour, as those of a catalogue. With ``start`` the origin is that
+        of ``start``.
     normalise : {'auto', 'stamps', 'curve-of-growth'}, optional
-        What is all the flux of a star: 'stamps', that of the Gaussians, as
-        the pixels of the stamps continue them; or 'curve-of-growth', with
-        what the stars show in rings beyond their stamps, up to three radii,
-        and as the power law of the outer rings goes on. The light beyond is
-        added as one wide Gaussian. By default it is added if the rings of at
-        least five stars show it beyond doubt; a message of the level INFO
-        tells. With ``start`` it is that of ``start``.
+        The definition of the total flux of a star: 'stamps' is the flux of
+        the Gaussians fitted to the stamps; 'curve-of-growth' adds the
+        light in rings beyond the stamps, up to three radii, and its
+        extrapolation with the power law of the outer rings, as one wide
+        Gaussian. By default this light is added if the rings of at least
+        five stars show it significantly; a message of the level INFO says
+        so. With ``start`` it is that of ``start``.
     pixel_integrated : 'auto' or bool, optional
-        Whether the Gaussians are those of the optics, integrated over each
-        pixel, or those of the PSF in pixels, sampled at the middle of each.
-        Sampled ones are quicker; integrated ones are needed where the pixels
-        are too coarse. By default the stars decide: PSFs narrower than 1.6
-        pixels, full width at half maximum in the pixels, are integrated.
-        With ``start`` it is as in ``start``, whose optics can be sampled but
-        not the reverse.
+        Whether the Gaussians describe the optics and are integrated over
+        each pixel, or include the pixel and are sampled at its middle.
+        Sampled Gaussians are faster; coarse pixels need integrated ones.
+        By default PSFs with a full width at half maximum below 1.6 pixels
+        are integrated. With ``start`` it is as in ``start``, whose optics
+        can be sampled but not the reverse.
     correlated_noise : bool, optional
-        Whether to look, on blank sky, if the noise of neighbouring pixels is
-        correlated, as in resampled images, and to take errors as larger for
-        that; a warning says so.
+        Whether to measure on blank sky if the noise of neighbouring pixels
+        is correlated, as in resampled images, and to increase the errors
+        accordingly; a warning says so.
     contexts : sequence of str, optional
-        Columns of ``stars``, as ``('colour',)``, on which the shapes depend
-        linearly, beside position. A star for which one is unknown (masked or
-        NaN) has the mean of the others. Not with ``start``.
+        Columns of ``stars``, such as ``('colour',)``, on which the shapes
+        depend linearly, in addition to position. A star with an unknown
+        value (masked or NaN) gets the mean of the others. Not with
+        ``start``.
     brighter_fatter : bool or 'auto', optional
-        Whether each unit of flux adds a covariance to all Gaussians, because
-        charge repels charge. With 'auto' that is so if the stars say so
-        beyond doubt, and a warning tells it; otherwise the field does not
-        change. What the Gaussians cannot describe may look alike, so that it
-        is off by default. ``field.mixture_at(x, y)`` is then the PSF of faint
-        stars, that of others needs their ``flux``. Not with ``start``.
+        Whether each unit of flux adds a covariance to all Gaussians,
+        because charge repels charge. With 'auto' the field includes this
+        only if it is significant, and a warning says so. It is off by
+        default, because a misfit of the Gaussians may look the same.
+        ``field.mixture_at(x, y)`` is then the PSF of faint stars; for
+        other stars give their ``flux``. Not with ``start``.
     executor : `~concurrent.futures.Executor`, optional
-        Where stars are worked on; by default a pool of threads.
+        The executor that works on stars; by default a pool of threads.
     progress_bar : bool, optional
-        Whether to show a bar with what is being fitted, and how often the
-        pixels of stars were gone through.
+        Whether to show a bar with the current stage of the fit and the
+        number of passes over the pixels of the stars.
 
     Returns
     -------

@@ -86,25 +86,26 @@ class MixtureField(Field):
         The radius of the stamps [pix].
     covariance : (N, N) `~numpy.ndarray`
         The covariance of the N = (6 K - 3) (T + C X) fitted coefficients,
-        shape by shape and term by term within a shape, those of contexts
-        behind the others. The first three shapes of the
-        first Gaussian are not fitted. What ``unmodelled`` does to the stars
-        that were fitted is in it.
+        ordered by shape, then by term, with those of contexts last. The
+        first three shapes of the first Gaussian are not fitted. The
+        covariance includes the effect of ``unmodelled`` on the fitted
+        stars.
     stars : `~astropy.table.QTable`
-        The stars, those that were dropped included: ``x``, ``y``, ``x_fit``,
-        ``y_fit``, ``flux_fit``, ``local_bkg``, ``reduced_chi2``,
-        ``n_pixels_fit``, ``n_pixels_rejected``, ``used`` and, where not used,
-        the ``reason``.
+        The stars, including those that were dropped: ``x``, ``y``,
+        ``x_fit``, ``y_fit``, ``flux_fit``, ``local_bkg``,
+        ``reduced_chi2``, ``n_pixels_fit``, ``n_pixels_rejected``, ``used``
+        and, where not used, the ``reason``.
     residual_stars : (n, s, s) `~numpy.ndarray`
         Data minus model of the stars in ``stars``; NaN outside the circle and
         at pixels that were not used.
     accuracy : float
-        The relative error of the PSF that the stars' chi^2 asks for.
+        The relative error of the PSF, determined from the chi^2 of the
+        stars.
     dropped : `~astropy.table.QTable`
         ``id`` and ``reason`` of the stars that were not used.
     choice : `~astropy.table.QTable`
         The reduced chi^2 of left-out stars for each ``n_components`` and
-        ``degree`` that was tried; empty if none was left to choose.
+        ``degree`` that was tried; empty if both were given.
     exposures : `~astropy.table.QTable`, optional
         If the stars are from several exposures, the covariance that each
         one adds to all Gaussians, ``xx``, ``xy``, ``yy`` [pix^2], about the
@@ -115,31 +116,33 @@ class MixtureField(Field):
         about its origin vanishes [pix]; infinite, the default, where the
         origin is the flux centroid.
     pixel_integrated : bool, optional
-        Whether the mixtures are those of the optics, to be integrated over
-        pixels. By default they contain the pixel and are sampled.
+        Whether the mixtures describe the optics and have to be integrated
+        over pixels. By default they include the pixel and are sampled.
     unmodelled : (6 K - 3,) `~numpy.ndarray`, optional
-        The variances of the shapes about their polynomials, such as stars
-        left out of the fit ask for; by default none.
+        The variances of the shapes about their polynomials, determined
+        from stars left out of the fit; by default none.
     wing_share, wing_error : float, optional
-        The share of the flux that one more Gaussian has, for the light beyond
-        the stamps, and its error; 0 unless that was measured.
+        The share of the flux in one more Gaussian, for the light beyond
+        the stamps, and its error; 0 if it was not measured.
     wing_stddev : float, optional
         The size of that Gaussian [pix].
     contexts : `~astropy.table.QTable`, optional
-        What shapes depend on beside position: ``name`` of the column of a
-        table of stars, ``mean``, ``stddev``, ``low`` and ``high`` of the
-        stars. Stars beyond ``low`` and ``high`` are as those there.
+        The quantities on which shapes depend in addition to position:
+        ``name`` of the column in a table of stars, and ``mean``,
+        ``stddev``, ``low`` and ``high`` of the stars. Stars beyond ``low``
+        or ``high`` get the PSF at this limit.
     context_coefficients : (C, X, K, 6) `~numpy.ndarray`, optional
-        What the shapes change by for each standard deviation of each of the
+        The change of the shapes for each standard deviation of each of the
         C contexts, times the first X = 1 or 3 terms.
     lateral_shifts : (C, X, 2) `~numpy.ndarray`, optional
-        How far in x and y the light is moved for it [pix].
+        The shift of the light in x and y for it [pix].
     brighter_fatter : `~astropy.table.QTable`, optional
-        If bright stars are wider, one row: the covariance that each unit of
-        flux adds to all Gaussians, ``xx``, ``xy``, ``yy`` [pix^2], their
-        errors ``xx_err``, ``xy_err``, ``yy_err``, the ``significance``, a
-        chi^2 with three degrees of freedom, and the ``largest`` flux of the
-        stars. The other numbers are then those of faint stars.
+        If bright stars are wider, one row: the covariance that each unit
+        of flux adds to all Gaussians, ``xx``, ``xy``, ``yy`` [pix^2],
+        their errors ``xx_err``, ``xy_err``, ``yy_err``, the
+        ``significance``, a chi^2 with three degrees of freedom, and the
+        ``largest`` flux of the stars. The other numbers are then for faint
+        stars.
 
     Examples
     --------
@@ -265,17 +268,17 @@ class MixtureField(Field):
         exposure : int, optional
             The exposure, from 0; by default the mean of all.
         flux : float, optional
-            That of the star, where bright stars are wider; by default that
-            of a faint one.
+            The flux of the star, if bright stars are wider; by default the
+            PSF is that of a faint star.
         **contexts : float, optional
-            What the field depends on beside position, as ``colour=0.7``; by
-            default the mean of the stars that it was fitted to.
+            The values of the contexts, such as ``colour=0.7``; by default
+            the mean of the fitted stars.
 
         Returns
         -------
         GaussianMixture
-            Of K Gaussians, its centre at the origin. It contains the pixel,
-            unless the field is ``pixel_integrated``.
+            A mixture of K Gaussians with its centre at the origin. It
+            includes the pixel, unless the field is ``pixel_integrated``.
 
         Raises
         ------
@@ -398,10 +401,9 @@ class MixtureField(Field):
         """
         Return the standard deviation of `aperture_correction`.
 
-        It holds the noise of the fitted shapes, what they do beyond the
-        polynomials, the light that the Gaussians leave of the stars inside
-        the radius and, if the light beyond the stamps was measured,
-        ``wing_error``.
+        It includes the noise of the fitted shapes, their changes beyond
+        the polynomials, the residual of the stars inside the radius and,
+        if the light beyond the stamps was measured, ``wing_error``.
 
         Parameters
         ----------
@@ -449,11 +451,11 @@ class MixtureField(Field):
 
     def psf_errors(self, *, exposure=None, flux=None, **contexts):
         """
-        Return how far the PSF may be off, for what is measured with it.
+        Return the errors of the PSF, for the errors of photometry.
 
-        The errors of the coefficients, and what the shapes do beyond the
-        polynomials, around places all over the detector. `to_grid` hands
-        them on.
+        They include the errors of the coefficients and the changes of the
+        shapes beyond the polynomials, at places all over the detector.
+        `to_grid` stores them in its grid.
 
         Parameters
         ----------
@@ -502,14 +504,14 @@ class MixtureField(Field):
             The number of nodes along y and x. They reach from the first
             pixel to the last.
         exposure, flux, **contexts : optional
-            Of which PSF, see `mixture_at`. Of flux and contexts that are not
-            given, the grid knows what they do, as its ``contexts``, and
-            `MixturePSFPhotometry` takes it into account.
+            Choose the PSF, see `mixture_at`. For a flux or contexts that
+            you do not give, the grid has the dependence on them as its
+            ``contexts``, and `MixturePSFPhotometry` uses it.
 
         Returns
         -------
         GriddedMixturePSF
-            It knows the errors of the field.
+            The grid, including the errors of the field.
 
         Raises
         ------

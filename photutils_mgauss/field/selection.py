@@ -38,7 +38,7 @@ def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
                      saturation=None, min_snr=50, max_stars=None,
                      finder=None, catalogue=None):
     """
-    Choose bright, isolated, unsaturated stars with whole stamps.
+    Select bright, isolated, unsaturated stars with complete stamps.
 
     Parameters
     ----------
@@ -62,21 +62,22 @@ def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
     radius : float, optional
         The radius of the stamps [pix]. They must be inside the image.
     isolation : float, optional
-        The least distance of a neighbour that has more than 1 % of the
-        star's light [pix]; ``radius`` by default.
+        The smallest allowed distance of a neighbour with more than 1 % of
+        the star's light [pix]; ``radius`` by default.
     saturation : float, optional
         Stars with a pixel at or above this value are saturated.
     min_snr : float, optional
-        The least signal-to-noise ratio of the flux within 3 pixels.
+        The smallest signal-to-noise ratio of the flux within 3 pixels.
     max_stars : int, optional
-        Keep only so many, the brightest of each part of the detector.
+        The largest number of stars to select, the brightest in each part
+        of the detector.
     finder : callable, optional
         A photutils star finder, called as ``finder(data, mask=mask)``;
         by default a `~photutils.detection.DAOStarFinder`.
     catalogue : `~astropy.table.Table`, optional
-        Stars that are known to be stars, as those of Gaia in the field, with
-        ``x`` and ``y`` [pix]. If at least 8 of them can be used, no others
-        are.
+        Sources that are known to be stars, for example from Gaia, with
+        ``x`` and ``y`` [pix]. If at least 8 of them can be used, only
+        these are selected.
 
     Returns
     -------
@@ -84,8 +85,8 @@ def select_psf_stars(data, sources=None, *, error=None, mask=None, fwhm=None,
         All sources: ``id``, ``x``, ``y``, ``flux`` (within 3 pixels of the
         star), ``snr``, ``peak``, ``selected`` and, for those that are not,
         the ``reason``: 'outside', 'edge', 'masked', 'saturated', 'faint',
-        'neighbor', 'shape', 'unlisted' or 'surplus'. `fit_mixture_field`
-        takes it as it is.
+        'neighbor', 'shape', 'unlisted' or 'surplus'. Give the whole table
+        to `fit_mixture_field`.
 
     Raises
     ------

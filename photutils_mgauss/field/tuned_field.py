@@ -35,10 +35,11 @@ __all__ = ['TunedMixtureField']
 @dataclass(frozen=True, eq=False, repr=False)
 class TunedMixtureField(Field):
     """
-    A known PSF with changes that are polynomials of position.
+    A known PSF, adjusted with polynomials of position.
 
-    Made by `fit_mixture_field` with ``start``. The centre of the PSF is where
-    that of ``start`` is, so that positions keep the archive's convention.
+    Made by `fit_mixture_field` with ``start``. The centre of the PSF is
+    that of ``start``, so that positions keep the convention of the
+    archive.
 
     Parameters
     ----------
@@ -52,12 +53,13 @@ class TunedMixtureField(Field):
     shape, radius, stars, residual_stars, accuracy, dropped
         As in `MixtureField`.
     covariance : (6 T, 6 T) `~numpy.ndarray`
-        Of the coefficients, change by change and term by term within one.
+        The covariance of the coefficients, ordered by change, then by
+        term.
     centre_stddev, pixel_integrated
         As in `MixtureField`.
     unmodelled : (6,) `~numpy.ndarray`, optional
-        The variances of the changes about their polynomials, such as stars
-        left out of the fit ask for; by default none.
+        The variances of the changes about their polynomials, determined
+        from stars left out of the fit; by default none.
 
     Examples
     --------
@@ -148,8 +150,8 @@ class TunedMixtureField(Field):
         Returns
         -------
         GaussianMixture
-            Of as many Gaussians as ``start`` has there. It contains the
-            pixel, unless the field is ``pixel_integrated``.
+            A mixture with as many Gaussians as ``start`` has there. It
+            includes the pixel, unless the field is ``pixel_integrated``.
 
         Raises
         ------
@@ -174,12 +176,12 @@ class TunedMixtureField(Field):
 
     def psf_errors(self):
         """
-        Return how far the PSF may be off, for what is measured with it.
+        Return the errors of the PSF, for the errors of photometry.
 
         Returns
         -------
         PSFErrors
-            What the changes may be off; ``start`` counts as exact.
+            The errors of the changes; ``start`` counts as exact.
         """
         known = {}
 

@@ -42,13 +42,13 @@ _POSITION = re.compile(r'([XY])(WIN|PSF|PEAK|MODEL)?_IMAGE(_DBL)?$')
 @dataclass(frozen=True, eq=False)
 class PSFExModel:
     r"""
-    A PSF that PSFEx measured, as it stands in its file.
+    A PSF model of PSFEx, as in its file.
 
     Attributes
     ----------
     planes : (T, ny, nx) `~numpy.ndarray`
-        An image for each polynomial term; not normalised. They contain the
-        pixel: the PSF is sampled, never integrated again.
+        An image for each polynomial term; not normalised. They include the
+        pixel: sample the PSF, do not integrate it again.
     exponents : (T, V) `~numpy.ndarray` of int
         The power of each context in each term.
     contexts : tuple of V str
@@ -193,9 +193,9 @@ def read_psfex(path, *, ext=None):
     OSError
         If the file cannot be opened.
     ValueError
-        If the file is not a PSFEx model, is damaged, or depends on a keyword
-        of the image's header, whose value at a star it does not tell; or if
-        it holds several models and ``ext`` does not say which to read.
+        If the file is not a PSFEx model, is damaged, or depends on a
+        keyword of the image's header, whose value it does not contain; or
+        if it has several models and ``ext`` does not choose one.
 
     Examples
     --------

@@ -134,10 +134,10 @@ class MixtureFit(ComparedByValue):
     residual : (ny, nx) `~numpy.ndarray` or `~astropy.units.Quantity`
         Image minus model, also outside the pixels used.
     covariance : (6K, 6K) `~numpy.ndarray`
-        Of flux, x_mean, y_mean, x_stddev, y_stddev and rho of each Gaussian
-        in turn, in the image's flux unit and native pixels. Without errors
-        it is scaled by chi2 over the degrees of freedom. NaN for a Gaussian
-        without flux.
+        The covariance of flux, x_mean, y_mean, x_stddev, y_stddev and rho
+        of each Gaussian in turn, in the image's flux unit and native
+        pixels. Without errors it is scaled by chi2 over the degrees of
+        freedom. NaN for a Gaussian without flux.
     used : (ny, nx) `~numpy.ndarray` of bool
         The pixels that were used.
 
@@ -228,9 +228,10 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
     Parameters
     ----------
     image : (ny, nx) or (n, ny, nx) array_like or NDData
-        The PSF sampled at pixel centres; it contains the pixel or not as the
-        mixture will. Negative wings are normal and not clipped. Its own mask
-        counts, its unit comes back: see :ref:`pixels`.
+        The PSF sampled at pixel centres. If it includes the pixel, the
+        mixture will include it too. Negative wings are normal and not
+        clipped. Its own mask counts, its unit comes back: see
+        :ref:`pixels`.
     n_components : int, optional
         The number K of Gaussians.
     oversampling : int or (y, x) tuple of int, optional
@@ -253,25 +254,26 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
         image's flux (the paper: 0.98).
     normalize : {'free', 'tied'}, optional
         Whether the total flux is fitted, or tied to the sum of the pixels
-        used. Tied, the light of the wings beyond the stamp is squeezed into
-        it.
+        used. If it is tied, the light of the wings beyond the stamp is
+        forced into it.
     signed : bool, optional
         Whether weights may be negative.
     means : {'free', 'fixed'}, optional
         Whether each Gaussian has its own mean, or all are at the origin.
     weighting : {'uniform', 'astrometric', 'photometric'}, optional
-        Whether only the residual is made small, or also the pixel-phase
-        errors it causes: those of noise-free stars at many phases of the
-        pixels, of their centroids in stamps of 5 x 5 and 7 x 7 native pixels
-        with 'astrometric', of their fluxes in 5 x 5 pixels with
-        'photometric'. They are linear in the residual and enter the sum of
-        squares as more rows. It needs an oversampling of 2 or more.
+        Whether the fit minimises only the residual, or also the
+        pixel-phase errors that it causes for noise-free stars at many
+        pixel phases: with 'astrometric' those of positions in stamps of 5
+        x 5 and 7 x 7 native pixels, with 'photometric' those of fluxes in
+        5 x 5 pixels. These errors are linear in the residual and are added
+        to the sum of squares. Both need an oversampling of 2 or more.
     start : GaussianMixture or sequence of them, optional
-        Where to start, one mixture of K Gaussians for all images or one for
-        each, such as the fit of a neighbour. None tries several starts of
-        its own.
+        The starting point, one mixture of K Gaussians for all images or
+        one for each, such as the fit of a neighbour. With None the
+        function tries several starting points.
     executor : `~concurrent.futures.Executor`, optional
-        Where to fit a stack. None is a pool of threads on all cores.
+        The executor that fits a stack. None is a pool of threads on all
+        cores.
 
     Returns
     -------
@@ -283,10 +285,10 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
     TypeError
         If an argument has the wrong type.
     ValueError
-        If an argument is not valid. For a single image also if it cannot be
-        fitted: it is empty, or NaN in pixels that are not masked, or has
-        fewer pixels than parameters. In a stack such an image gets a status
-        instead and the others are not affected.
+        If an argument is not valid. For a single image also if it cannot
+        be fitted: it is empty, has NaN in unmasked pixels, or has fewer
+        pixels than parameters. In a stack such an image gets a status
+        instead, and the others are still fitted.
 
     Notes
     -----
@@ -294,8 +296,8 @@ def fit_mixture(image, n_components=3, *, oversampling=1, origin=None,
     its precision matrix, so that every step is a valid mixture; fluxes are
     solved for exactly at each step. Standard deviations are kept above 0.4
     image pixels (also above a quarter of a native pixel with the weighting
-    'photometric') and below the size of the stamp, and means on the stamp, by
-    a price that is zero inside these limits.
+    'photometric') and below the size of the stamp, and means on the stamp,
+    by a penalty that is zero inside these limits.
 
     Examples
     --------

@@ -116,10 +116,11 @@ def select_n_components(image, n_components=(1, 2, 3, 4, 5), *,
                         rms_residual=None, max_residual=None,
                         phase_error=None, **kwargs):
     """
-    Return the number of Gaussians an image needs.
+    Return the number of Gaussians that an image needs.
 
-    That is the smallest that meets the thresholds given; without thresholds,
-    the one with the smallest Bayesian information criterion.
+    This is the smallest number that meets the given thresholds; without
+    thresholds, the number with the smallest Bayesian information
+    criterion.
 
     Parameters
     ----------

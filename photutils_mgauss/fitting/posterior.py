@@ -43,7 +43,7 @@ _FIT_KEYWORDS = ('oversampling', 'origin', 'error', 'mask', 'radius',
 @dataclass(frozen=True, eq=False, repr=False)
 class MixturePosterior:
     """
-    Draws from the posterior of a mixture, their labels sorted out.
+    Draws from the posterior of a mixture, with matched labels.
 
     Arrays have the shape (chains, draws, ...); lengths are in native pixels.
 
@@ -61,12 +61,12 @@ class MixturePosterior:
         The total flux.
     sigma : (c, d) `~numpy.ndarray`
         The standard deviation of the pixels [image unit], or the factor on
-        the errors where these were given.
+        the errors if these were given.
     fit : MixtureFit
-        The least-squares solution the chains started from.
+        The least-squares solution at which the chains started.
     idata : `arviz.InferenceData` or `xarray.DataTree`
-        What PyMC returned: the paper's names, labels as sampled, lengths in
-        arcsec for the paper's priors, fluxes relative to ``fit.flux``.
+        The output of PyMC: the paper's names, labels as sampled, lengths
+        in arcsec for the paper's priors, fluxes relative to ``fit.flux``.
 
     Examples
     --------

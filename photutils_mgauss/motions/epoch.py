@@ -21,7 +21,7 @@ from photutils_mgauss.utils.star_columns import find_column
 @dataclass(frozen=True, eq=False)
 class Epoch:
     """
-    One exposure: a table of stars, and where and when they were seen.
+    One exposure: a table of stars with its WCS, time and observer.
 
     Parameters
     ----------
@@ -31,9 +31,10 @@ class Epoch:
         * pixels, 0 at the centre of the first one: ``x_fit``, ``y_fit``,
           ``x_err``, ``y_err`` as photutils names them (or ``x``, ``y``),
           optionally the covariance ``xy_cov`` [pix^2]; or
-        * ICRS positions: ``ra``, ``dec`` [deg], ``ra_error``, ``dec_error``
-          [mas], the first with the cosine of the declination in it, as in
-          the Gaia catalogue (``ra_err`` and ``dec_err`` will do); or
+        * ICRS positions: ``ra``, ``dec`` [deg], ``ra_error``,
+          ``dec_error`` [mas], the first including the cosine of the
+          declination, as in the Gaia catalogue (``ra_err`` and ``dec_err``
+          are accepted); or
         * scans that measure one direction: ``along`` [mas], the place along
           the scan from ``ra``, ``dec``, its error ``along_error``, and
           ``scan_angle`` [deg], the direction of the scan from north through
@@ -53,13 +54,14 @@ class Epoch:
         Middle of the exposure; numbers are Julian years (TDB). Required
         unless the table has a column ``time``.
     observer : str or `~astropy.coordinates.CartesianRepresentation`, optional
-        Where the parallax is seen from: 'earth' (the default), 'leo', 'l2',
-        or a barycentric place. Only if that place has a velocity attached
-        are positions corrected for aberration; see `barycentric_observer`.
+        The place of the observer, for parallaxes: 'earth' (the default),
+        'leo', 'l2', or a barycentric position. If this position has a
+        velocity attached, positions are also corrected for aberration; see
+        `barycentric_observer`.
     pixel_scale : `~astropy.units.Quantity`, optional
         Angle of one pixel, for epochs without WCS.
     chips : dict, optional
-        In place of ``wcs`` the WCS of each chip of a camera, by the names
+        Instead of ``wcs``, the WCS of each chip of a camera, by the names
         in a column ``chip``; see `Epoch.of_chips`.
 
     Raises
@@ -90,8 +92,8 @@ class Epoch:
         """
         Return one exposure of a camera with several chips.
 
-        It has one map onto the other epochs, whatever their number, and
-        chips of the same name have the same distortion in all exposures.
+        It has one map to the other epochs for all chips, and chips with
+        the same name have the same distortion in all exposures.
 
         Parameters
         ----------
@@ -100,7 +102,7 @@ class Epoch:
         time, observer : optional
             As for an epoch.
         names : sequence, optional
-            What the chips are called; the default is their numbers from 0.
+            The names of the chips; by default their numbers from 0.
             Different cameras need different names.
 
         Returns
@@ -156,7 +158,7 @@ class Epoch:
 
     @property
     def is_pixels(self):
-        """Whether positions are x, y, which win over ra, dec."""
+        """Whether positions are x, y, which have priority over ra, dec."""
         has_xy = find_column(self.table, names_of('x')) is not None
         has_sky = 'ra' in self.table.colnames
         return has_xy and (self._has_wcs or not has_sky)
@@ -172,7 +174,7 @@ class Epoch:
 
     @property
     def is_sky(self):
-        """Whether the epoch has places in the sky, by WCS or ra, dec."""
+        """Whether the epoch has positions on the sky, by WCS or ra, dec."""
         return self._has_wcs or not self.is_pixels
 
     @property

@@ -30,9 +30,9 @@ class ProperMotionFitter:
     Parameters
     ----------
     transform : str or None, optional
-        What may differ between the frames of the epochs: 'shift', 'rigid',
-        'similarity', 'affine', 'poly-n' (a polynomial of degree n), or None
-        for frames that are perfect already.
+        How the frames of the epochs may differ: 'shift', 'rigid',
+        'similarity', 'affine', 'poly-n' (a polynomial of degree n), or
+        None for frames that need no correction.
     parallax : {False, True, 'prior'}, optional
         Whether parallaxes are fitted; 'prior' adds the ``parallax_prior`` to
         stars of unknown parallax.
@@ -54,20 +54,21 @@ class ProperMotionFitter:
     ref_epoch : `~astropy.time.Time` or float, optional
         Epoch of the positions; the default is the mean time of the epochs.
     systematic : {'fit', 'magnitude', None} or Quantity, optional
-        Error added in quadrature to each axis of every detection of an
-        epoch: found from the scatter of the references, none, or given (one
-        value, or one for each epoch). 'magnitude' also multiplies the errors
-        of each epoch by a smooth function of the magnitude, found from the
-        scatter of all stars: for lists whose errors are too small for some
-        stars and too large for others.
+        The error added in quadrature to each axis of every detection of an
+        epoch: determined from the scatter of the references, none, or
+        given (one value, or one for each epoch). 'magnitude' also
+        multiplies the errors of each epoch by a smooth function of the
+        magnitude, determined from the scatter of all stars. Use it if the
+        errors are too small for some stars and too large for others.
     executor : `~concurrent.futures.Executor`, optional
-        Where the work is done; the default is threads on all processors.
+        The executor for the work; by default threads on all processors.
     match_by : {'auto', 'id', 'sky', 'pattern'}, optional
         How epochs are matched. 'auto' uses the column ``id`` if all epochs
         have one and equal identifiers are at equal places, else positions,
-        as 'sky' does. 'pattern' first finds where each epoch looks by the
-        asterisms of its bright stars: for lists without WCS, and WCS with a
-        pointing off by up to the field of view or a wrong roll.
+        as 'sky' does. 'pattern' first finds the pointing of each epoch
+        from the pattern of its bright stars: use it for lists without WCS,
+        and for a WCS whose pointing is off by up to the field of view or
+        whose roll is wrong.
     match_radius : `~astropy.units.Quantity`, optional
         Largest distance of a match. The default follows from the errors
         and ``max_motion``.
@@ -89,17 +90,19 @@ class ProperMotionFitter:
     rng : `~numpy.random.Generator` or int, optional
         For choosing the references held out.
     distortion : str or None, optional
-        What the chips of `Epoch.of_chips` may differ by from their WCS, the
-        same in all exposures: 'affine', 'poly-n', or None for nothing.
+        How the chips of `Epoch.of_chips` may differ from their WCS, the
+        same in all exposures: 'affine', 'poly-n', or None for no
+        difference.
     distortion_prior : `~astropy.units.Quantity`, optional
-        How large each term of it may be at the edge of a chip.
+        The prior size of each of its terms at the edge of a chip.
     terms : str or sequence of str, optional
-        What detections of an epoch may be displaced by: 'magnitude' and
-        'colour' (columns ``colour``, ``color`` or ``bp_rp``), smooth
-        functions of these, and 'y', along the rows of the detector, in
-        proportion to the row and a function of magnitude, as imperfect
-        charge transfer does it. Those that cross-validation does not confirm
-        are left out; see `MotionSolution.terms`.
+        The quantities on which displacements of detections may depend:
+        'magnitude' and 'colour' (columns ``colour``, ``color`` or
+        ``bp_rp``), with smooth functions of these, and 'y', along the rows
+        of the detector, in proportion to the row and a function of
+        magnitude, as with imperfect charge transfer. Terms that
+        cross-validation does not confirm are left out; see
+        `MotionSolution.terms`.
 
     Examples
     --------
@@ -174,9 +177,9 @@ class ProperMotionFitter:
         Raises
         ------
         ValueError
-            If the epochs have no time baseline, with each other or with
-            positions of references, or no stars in common, or an epoch has
-            fewer references than its map needs.
+            If the epochs have no time baseline, neither with each other
+            nor with positions of references, or have no stars in common,
+            or if an epoch has fewer references than its map needs.
         """
         options = self._options()
         with waiting('ProperMotionFitter.fit'):

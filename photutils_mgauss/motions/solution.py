@@ -41,7 +41,7 @@ from photutils_mgauss.utils.validation import as_integer
 
 def decode_motion_flags(flags):
     """
-    Return the sentences the flags of a star stand for.
+    Return the meaning of the flags of a star, in sentences.
 
     Parameters
     ----------
@@ -90,21 +90,21 @@ def solution_of(result, ref_epoch=None):
 @dataclass(frozen=True, eq=False)
 class MotionSolution:
     """
-    Proper motions, and the frames they were measured in.
+    Proper motions and the corrected frames of the epochs.
 
     Parameters
     ----------
     stars : `~astropy.table.QTable`
         One row per star, with the Gaia catalogue's column names: ``ra``,
         ``dec`` [deg] (``x``, ``y`` for planes without sky), ``parallax``
-        [mas], ``pmra`` (with the cosine of the declination in it) and
+        [mas], ``pmra`` (including the cosine of the declination) and
         ``pmdec`` [mas / yr], an ``_error`` for each, the ten ``_corr``,
         ``ref_epoch`` (Julian year, TDB), ``n_obs``, ``n_good_obs``,
         ``visibility_periods_used``, ``chi2``, ``dof``, ``uwe``, ``ruwe``
-        (over what is usual at the star's flux), ``flags`` (see
+        (relative to the usual value at the star's flux), ``flags`` (see
         `decode_motion_flags`); with accelerations ``accra``, ``accdec``,
-        their errors, and ``acc_significance``, the length of that vector in
-        its errors.
+        their errors, and ``acc_significance``, the length of that vector
+        in its errors.
     epochs : list of `Epoch`
         The epochs given, with corrected WCS.
     alignment : `~astropy.table.QTable`
@@ -112,10 +112,10 @@ class MotionSolution:
         the references used and rejected, the rms of their residuals, and
         the systematic error found.
     notes : tuple of str
-        What speaks against the references (each of these is a warning
-        of the fit, too) or the errors, what the data could not determine
-        and the fit did not use, and which epochs have few stars in common
-        with the others, in sentences.
+        Sentences about signs of wrong references (the fit also warns of
+        these) or wrong errors, quantities that the data could not
+        determine, data that the fit did not use, and epochs with few stars
+        in common with the others.
 
     Examples
     --------
@@ -172,9 +172,9 @@ class MotionSolution:
         """
         One row per detection, as a `~astropy.table.QTable`.
 
-        The aligned position, its residual towards east and north, what the
-        residual would be had the detection not been used, and its
-        chi-square (of two degrees of freedom, leverage taken into account).
+        The aligned position, its residual towards east and north, the
+        residual from a fit without this detection, and its chi-square
+        (with two degrees of freedom, including leverage).
         """
         return residual_table(self._fit)
 
@@ -184,10 +184,10 @@ class MotionSolution:
         The terms that cross-validation confirmed, as a table.
 
         One row for each function of each epoch, a `~astropy.table.QTable`:
-        what is to be added to x and y of a detection [pix] (of epochs in
-        the sky, in their units) is ``dx``, ``dy`` times powers (``powers``)
-        of magnitude, colour and row. The former are scaled by the middle
-        and half range in ``meta``, within -1.5 and 1.5, the row by ``rows``.
+        to correct x and y of a detection [pix] (or positions on the sky,
+        in their units), add ``dx``, ``dy`` times powers (``powers``) of
+        magnitude, colour and row. The former are scaled by the middle and
+        half range in ``meta``, within -1.5 and 1.5, the row by ``rows``.
         No rows where there are no terms.
         """
         return fitted_terms(self._fit)
@@ -208,7 +208,7 @@ class MotionSolution:
 
     def at(self, time):
         """
-        Return the stars at another epoch, with the covariances of then.
+        Return the stars at another epoch, with their covariances then.
 
         Parameters
         ----------
@@ -219,8 +219,9 @@ class MotionSolution:
         -------
         `~astropy.table.QTable`
             Like ``stars``. Positions move along straight lines on the
-            tangent plane, which are great circles; their errors grow away
-            from the epochs observed, as the correlations say.
+            tangent plane, which are great circles; their errors grow with
+            the time from the observed epochs, according to the
+            correlations.
         """
         return _stars_at(self._fit, float(julian_years(time)))
 
@@ -251,7 +252,7 @@ class MotionSolution:
 
     def mean(self, ids=None):
         """
-        Return the mean motion of some stars, as of the members of a cluster.
+        Return the mean motion of some stars, such as members of a cluster.
 
         Parameters
         ----------
@@ -261,16 +262,17 @@ class MotionSolution:
         Returns
         -------
         `~astropy.table.QTable`
-            One row: ``pmra``, ``pmdec``, their errors and correlation, with
-            the error of the frames, which all stars have in common;
-            ``dispersion``, what the motions scatter beyond their errors, and
-            ``n``, the number of stars with motions.
+            One row: ``pmra``, ``pmdec``, their errors and correlation,
+            with the error of the frames, which all stars have in common;
+            ``dispersion``, the scatter of the motions beyond their errors,
+            and ``n``, the number of stars with motions.
 
         Raises
         ------
         ValueError
             If a star is unknown or none has a motion, or motions are
-            relative: the mean of all is zero then by choice.
+            relative, because the mean of all stars is then zero by
+            definition.
         """
         self._check_absolute('for the mean of motions')
         stars = (np.flatnonzero(np.asarray(self.stars['reference']) == '')
@@ -287,8 +289,8 @@ class MotionSolution:
         """
         Return the probability of each star to move with a cluster.
 
-        A mixture of a cluster and the field is fitted to the motions, each
-        with its own covariance. References take no part.
+        The method fits a mixture of a cluster and the field to the
+        motions, each with its own covariance. It leaves out references.
 
         Parameters
         ----------
@@ -298,9 +300,9 @@ class MotionSolution:
         Returns
         -------
         `~astropy.table.QTable`
-            ``id`` and ``membership``, NaN for stars without a motion, in the
-            order of ``stars``. Its ``meta`` has the part of the stars that
-            are members, their mean motion and dispersion.
+            ``id`` and ``membership``, NaN for stars without a motion, in
+            the order of ``stars``. Its ``meta`` has the fraction of
+            members, their mean motion and dispersion.
 
         Raises
         ------
@@ -313,23 +315,24 @@ class MotionSolution:
 
     def accelerations(self):
         """
-        Test whether stars move straight.
+        Test whether stars move on straight lines.
 
-        In the frames found, from the detections in use alone, an
-        acceleration is fitted to each star, and then a jerk beside it. A
-        detection that was rejected as an outlier does not count, though it
-        may be what bends the motion: see ``clip`` of the fitter.
+        The method fits an acceleration to the used detections of each star
+        in the frames of the solution, and then also a jerk. It leaves out
+        detections that were rejected as outliers, even if they are due to
+        an acceleration: see ``clip`` of the fitter.
 
         Returns
         -------
         `~astropy.table.QTable`
             ``id``, in the order of ``stars``; ``accra``, ``accdec``, their
             errors and ``acc_significance``, fitted without a jerk;
-            ``jerkra``, ``jerkdec``, their errors and ``jerk_significance``.
-            A significance is the length of the vector in its errors; without
-            any acceleration it exceeds 3 for one star in 90. NaN where there
-            are too few detections: an acceleration takes three at different
-            times, a jerk four, and a parallax one more.
+            ``jerkra``, ``jerkdec``, their errors and
+            ``jerk_significance``. A significance is the length of the
+            vector in units of its errors; without any acceleration it
+            exceeds 3 for one star in 90. NaN if there are too few
+            detections: an acceleration takes three at different times, a
+            jerk four, and a parallax one more.
 
         Examples
         --------
@@ -380,9 +383,9 @@ class MotionSolution:
         """
         Compare the references in use with their catalogue.
 
-        Their motions are those of `measured`, for which the catalogue says
-        nothing but where the frames are. As the references tie the frames,
-        a few of them agree better than their errors say.
+        Their motions are those of `measured`, for which the catalogue is
+        only used to find the frames. Because the references define the
+        frames, a small number of them agrees better than their errors.
 
         Returns
         -------
@@ -402,15 +405,15 @@ class MotionSolution:
         Returns
         -------
         `~astropy.table.QTable`
-            With the rows of ``residuals``: ``chip``, the pixel ``x_pix`` and
-            ``y_pix``, and the residual ``dx_pix`` and ``dy_pix``. Detections
-            that came as places on the sky have NaN.
+            With the rows of ``residuals``: ``chip``, the pixel ``x_pix``
+            and ``y_pix``, and the residual ``dx_pix`` and ``dy_pix``.
+            Detections that were given as positions on the sky have NaN.
         """
         return detector_residuals(self.residuals, self.epochs)
 
     def bootstrap(self, n_resamples=10000, *, rng=None):
         """
-        Resample the reference objects to see the error of the frames.
+        Resample the reference objects to find the error of the frames.
 
         Parameters
         ----------
@@ -424,7 +427,7 @@ class MotionSolution:
         draws : object
             ``draws.shift`` (n_resamples, E, 2) is the change of each map
             at the centre of the field [mas], ``draws.motion``
-            (n_resamples, 2) that of all motions in common [mas / yr].
+            (n_resamples, 2) the common change of all motions [mas / yr].
 
         Raises
         ------
@@ -474,10 +477,11 @@ class MotionSolution:
 
     def measured(self):
         """
-        Return the stars as the detections alone have them.
+        Return the stars as measured by the detections alone.
 
-        The same table as ``stars``, in the same frames, but without what the
-        catalogue says of each reference object: for comparing the two.
+        The same table as ``stars``, in the same frames, but without the
+        catalogue values of reference objects, so that you can compare the
+        two.
 
         Returns
         -------

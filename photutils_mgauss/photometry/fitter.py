@@ -57,10 +57,10 @@ class MixtureFitter:
     Attributes
     ----------
     fit_info : dict
-        Of the last fit: ``param_cov`` (covariance of the free parameters, or
-        None), ``fun`` (weighted model minus data), ``status`` (1 to 4 for
-        success), ``message`` and ``nfev``. Where several threads use the
-        object, each sees what came out of its own last fit.
+        Of the last fit: ``param_cov`` (covariance of the free parameters,
+        or None), ``fun`` (weighted model minus data), ``status`` (1 to 4
+        for success), ``message`` and ``nfev``. If several threads use the
+        object, each sees the result of its own last fit.
 
     Examples
     --------

@@ -8,8 +8,8 @@ def decode_psf_flags(flags, *, return_bit_values=False):
     """
     Return the names of the bits of ``flags``.
 
-    As `photutils.psf.decode_psf_flags`, which leaves out the bits that tables
-    of `CrowdedMixturePhotometry` have beside photutils' own.
+    Like `photutils.psf.decode_psf_flags`, but including the additional
+    bits of tables of `CrowdedMixturePhotometry`.
 
     Parameters
     ----------

@@ -61,21 +61,21 @@ class MixturePSFPhotometry(PSFPhotometry):
     """
     PSF photometry of many stars with a PSF made of Gaussians.
 
-    A drop-in replacement of `photutils.psf.PSFPhotometry`: all its keywords,
-    methods and columns are here. Stars are fitted in compiled code, on all
+    A drop-in replacement of `photutils.psf.PSFPhotometry` with the same
+    keywords, methods and columns. It fits stars in compiled code, on all
     cores; grouped stars are fitted jointly.
 
     Parameters
     ----------
     psf_model : GriddedMixturePSF, MultiGaussianPSFModel or MixtureField
-        The PSF. If it depends on the colour of stars, or their flux, as
-        fields of several ``contexts`` do, each star is fitted with its own
-        one; ``init_params`` has a column of that name then. Parameters that
-        are ``fixed`` are not fitted: with ``x_0``
-        and ``y_0`` fixed the photometry is forced. Any other PSF model, a
-        model whose shape is free, and a grid with another ``interpolation``
-        than 'blend' or ``outside`` than 'clamp' is handed to
-        `~photutils.psf.PSFPhotometry`, and a warning says so.
+        The PSF. If it depends on the colour or the flux of stars, as fields
+        with ``contexts`` do, each star is fitted with its own PSF;
+        ``init_params`` needs a column with the name of the context. Parameters
+        that are ``fixed`` are not fitted: with ``x_0`` and ``y_0`` fixed the
+        photometry is forced. Any other PSF model, a model whose shape is free,
+        and a grid with another ``interpolation`` than 'blend' or ``outside``
+        than 'clamp' is left to `~photutils.psf.PSFPhotometry`, and a warning
+        says so.
     fit_shape : int or (ny, nx) tuple of int
         The shape of the fitted region, odd.
     fitter : object, optional
@@ -83,57 +83,56 @@ class MixturePSFPhotometry(PSFPhotometry):
         fitter everything is left to `~photutils.psf.PSFPhotometry`, and a
         warning says so.
     executor : `~concurrent.futures.Executor`, optional
-        Where the fits run; by default a pool of threads on all cores.
+        The executor for the fits; by default a pool of threads on all cores.
     n_threads : int, optional
-        In how many threads the fits run, instead of on all cores; cannot be
-        given beside ``executor``. The compiled engine needs no free-threaded
+        The number of threads for the fits, instead of all cores; cannot be
+        combined with ``executor``. The compiled engine needs no free-threaded
         Python for this.
     fit_sky : bool, optional
         Whether to fit a level of the sky for each group, on top of
         ``local_bkg``; adds the columns ``sky`` and ``sky_err``.
     effective_gain : float, optional
-        If given, ``error`` holds the noise of the background alone, and that
-        of the stars' own light is added: light over ``effective_gain``, in
-        the same units.
+        If given, ``error`` has only the noise of the background, and the noise
+        of the stars' own light is added: light divided by ``effective_gain``,
+        in the same units.
     variance : {'model', 'data'}, optional
-        Whether the light in the variance is that of the fitted model or the
-        pixels' own. Pixels that scatter low get too much weight in the
-        latter (Eq. 10 of Nie et al.), and fluxes come out low. Only used
-        with ``effective_gain``.
+        Whether the variance uses the light of the fitted model or of the
+        pixels. With the pixels (Eq. 10 of Nie et al.), those that are low by
+        chance get too much weight, and fluxes come out too low. Only used with
+        ``effective_gain``.
     xy_cov : bool, optional
         Whether to add the column ``xy_cov``, the covariance of ``x_fit`` and
         ``y_fit`` [pix^2].
     psf_errors : bool, optional
-        Whether the errors contain what the PSF may be off, if ``psf_model``
-        knows that, as a `MixtureField` and its grid do. That part is also
-        in columns of its own, ``x_psf_err``, ``y_psf_err`` [pix] and
-        ``flux_psf_err``: it is common to stars that are near each other.
+        Whether the errors include the errors of the PSF, if ``psf_model`` has
+        them, as a `MixtureField` and its grid do. This part also has its own
+        columns, ``x_psf_err``, ``y_psf_err`` [pix] and ``flux_psf_err``; stars
+        near each other share it.
     correlated_noise : bool, optional
-        Whether to look, on blank sky, if the noise of neighbouring pixels is
-        correlated, as in resampled images, and to enlarge the errors for
-        that. What was found is in ``meta['noise_correlation']`` of the
-        table, and a warning tells it. Only used with ``error``.
+        Whether to measure on blank sky if the noise of neighbouring pixels is
+        correlated, as in resampled images, and to increase the errors
+        accordingly. A warning and ``meta['noise_correlation']`` of the table
+        have the result. Only used with ``error``.
     saturation : float or `~astropy.units.Quantity`, optional
-        The level from which pixels are saturated, in the unit of the data
-        and, as these, without the background; infinity if masks and NaN
-        tell. If given, such pixels are left out, with the trails along
-        rows and columns that their charge has run into and a pixel around
-        them; stars behind them are fitted to their wings, from where these
-        say they are, in as many pixels as that takes, and have bit 65536 in
-        ``flags``. Their errors grow by the root of ``reduced_chi2`` where it
-        is above one.
+        The level at which pixels saturate, in the unit of the data and, like
+        the data, without the background; infinity if masks or NaN mark
+        saturated pixels. If given, these pixels, the trails of their charge
+        along rows and columns, and a margin of one pixel are left out. Such
+        stars are fitted to their wings, which also give the first position, in
+        as many pixels as needed, and have bit 65536 in ``flags``. Their errors
+        are multiplied by the root of ``reduced_chi2`` if it is above one.
     residual_radius : float, optional
-        If given, spikes, rings and ghosts of bright stars that the PSF does
-        not have are measured on the image, out to this distance [pix] and
-        fading beyond it: the mean of what is left of all bright stars, as
-        far as it stands out of noise. It is taken off each of them, and all
-        stars are fitted again. What was measured is ``psf_residual``; a
-        warning says if there are too few stars. Not for a PSF that depends
-        on colours or fluxes, nor for one that is left to photutils.
+        If given, spikes, rings and ghosts of bright stars that the PSF lacks
+        are measured on the image, out to this distance [pix] and fading beyond
+        it. They are the mean residual of all bright stars, as far as it is
+        significant. This residual is subtracted from each of these stars, and
+        all stars are fitted again. ``psf_residual`` has the result; a warning
+        says if there are too few stars. Not for a PSF that depends on colours
+        or fluxes, nor for one that is left to photutils.
     aperture_radius_correction : float, optional
-        If given, adds the column ``aperture_correction``: what to multiply a
-        flux measured within this radius [pix] by, the inverse of the PSF's
-        encircled energy at the star.
+        If given, adds the column ``aperture_correction``: the factor from a
+        flux within this radius [pix] to the total flux, the inverse of the
+        PSF's encircled energy at the star.
     **kwargs
         The keywords of the installed `~photutils.psf.PSFPhotometry`:
         ``finder``, ``grouper``, ``fitter_maxiters``, ``xy_bounds``,
@@ -144,12 +143,12 @@ class MixturePSFPhotometry(PSFPhotometry):
     ----------
     results : `~astropy.table.QTable`
         The table of the last call, with the columns of photutils. Several
-        threads may call one object; each sees its own last call.
+        threads may call one object; each sees the table of its own last call.
     init_params : `~astropy.table.QTable`
         The initial parameters.
     psf_residual : PSFResidual or None
-        What the PSF leaves of bright stars, if it was measured in the last
-        call; its ``image(x, y, flux)`` draws that of some stars.
+        The mean residual of bright stars, if the last call measured it; its
+        ``image(x, y, flux)`` draws it for given stars.
     fit_info : list of dict
         ``param_cov`` (covariance of the free parameters, in the order flux,
         x, y), ``status`` and ``message`` of each star, in the order of
@@ -158,9 +157,9 @@ class MixturePSFPhotometry(PSFPhotometry):
     Raises
     ------
     ValueError
-        In the call: as photutils does, for arrays of different shapes,
-        errors that are not positive under a star, ids that are not unique,
-        or a ``fitter_maxiters`` below 1.
+        In the call, as in photutils: for arrays of different shapes, errors
+        that are not positive under a star, ids that are not unique, or a
+        ``fitter_maxiters`` below 1.
 
     Examples
     --------
@@ -240,7 +239,7 @@ class MixturePSFPhotometry(PSFPhotometry):
         error : float or (ny, nx) array_like, optional
             The standard deviation of each pixel in the unit of ``data``.
         init_params : `~astropy.table.Table`, optional
-            Where the stars are, as photutils takes it; by default what
+            The initial positions, as for photutils; by default those that
             ``finder`` finds.
 
         Returns

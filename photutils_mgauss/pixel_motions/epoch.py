@@ -18,19 +18,19 @@ from photutils_mgauss.utils.image import read_pixels
 @dataclass(frozen=True, eq=False)
 class ImageEpoch:
     """
-    One image for `PixelMotionFitter`, and where and when it was taken.
+    One image for `PixelMotionFitter`, with its PSF, WCS and time.
 
     Parameters
     ----------
     data : (ny, nx) array_like or `~astropy.nddata.NDData`
-        The pixels; what forms are taken is in :ref:`pixels`. A smooth
-        background may be left in.
+        The pixels, in any form that :ref:`pixels` lists. You need not
+        subtract a smooth background.
     psf : GriddedMixturePSF, MultiGaussianPSFModel or MixtureField
         The PSF of this image.
     wcs : APE 14 WCS
-        A gwcs or `astropy.wcs.WCS` with celestial axes: that of a
-        `MotionSolution` of the brighter stars, which knows how the images
-        lie to one another.
+        A gwcs or `astropy.wcs.WCS` with celestial axes, from a
+        `MotionSolution` of the brighter stars, so that the images are
+        aligned.
     time : `~astropy.time.Time` or float
         Middle of the exposure; numbers are Julian years (TDB).
     error : array_like, optional
@@ -39,9 +39,9 @@ class ImageEpoch:
     mask : (ny, nx) array_like of bool, optional
         True for pixels to leave out.
     band : str, optional
-        The filter, for fluxes that images of a band have in common.
+        The filter, for fluxes that all images of a band share.
     observer : str or `~astropy.coordinates.CartesianRepresentation`, optional
-        Where the parallax is seen from, as for `Epoch`.
+        The place of the observer, as for `Epoch`.
 
     Raises
     ------

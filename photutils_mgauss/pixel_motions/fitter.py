@@ -59,33 +59,34 @@ class PixelMotionFitter:
     acceleration : bool, optional
         Whether accelerations are fitted.
     references : `MotionSolution`, optional
-        The solution that the WCS of the images come from: the covariance of
-        its frames is added to that of each star. Without it the WCS are
-        taken as they are.
+        The solution that gave the WCS of the images: the covariance of its
+        frames is added to that of each star. Without it the WCS count as
+        exact.
     fit_shape : int or (ny, nx) tuple of int, optional
         The pixels of each star in each image.
     fit_sky : bool, optional
-        Whether a level of the sky is fitted to each star in each image.
+        Whether to fit a level of the sky for each star in each image.
     forced : bool, optional
-        Whether places and motions are those of the stars given, and only
-        fluxes are fitted.
+        Whether to keep the given positions and motions and fit only the
+        fluxes.
     executor : `~concurrent.futures.Executor`, optional
-        Where the work is done; the default is threads on all processors.
+        The executor for the work; by default threads on all processors.
     progress_bar : bool, optional
-        Whether to show how far the work is.
+        Whether to show a progress bar.
     flux : {'image', 'band', 'common'}, optional
-        What has a flux of its own: each image, each band, or nothing but
-        the star. Fluxes in common make faint stars a little more precise;
-        they need images of one scale and stars that do not vary.
+        Whether a star has a flux for each image, for each band, or one
+        flux in all images. Common fluxes make faint stars slightly more
+        precise; they need images with the same scale and stars that do not
+        vary.
     reach : float, optional
-        How far from its given place and motion a faint star may be in each
-        image, in units of the FWHM of the PSF, unless the data are sure that
-        it is farther away. Bright stars are free.
+        The largest distance of a faint star from its given position and
+        motion in each image, in units of the FWHM of the PSF, unless the
+        data clearly show it farther away. Bright stars are free.
     refine_frames : bool, optional
-        Whether the frames of the images are found from the pixels of the
-        bright stars, together with these: the WCS gets an affine map each,
-        which ``wcs`` of the solution contains. Positions and motions of all
-        stars together stay as the WCS and ``references`` have them.
+        Whether to fit the frames of the images to the pixels of the bright
+        stars, together with these stars: each WCS gets an affine map,
+        which ``wcs`` of the solution includes. The common position and
+        motion of all stars stay those of the WCS and ``references``.
 
     Examples
     --------
@@ -143,10 +144,10 @@ class PixelMotionFitter:
             In any order, with any PSFs; their units are converted to that of
             the first.
         stars : `~astropy.table.Table` or `~astropy.coordinates.SkyCoord`
-            Where the stars are, to a pixel or so: ``ra`` and ``dec`` [deg],
-            at ``ref_epoch`` or else at the mean time of the images;
-            optionally ``id``, ``pmra``, ``pmdec`` and ``parallax``. By
-            default what `find` finds.
+            The positions of the stars, to about a pixel: ``ra`` and
+            ``dec`` [deg], at ``ref_epoch`` or else at the mean time of the
+            images; optionally ``id``, ``pmra``, ``pmdec`` and
+            ``parallax``. By default what `find` finds.
 
         Returns
         -------
@@ -180,36 +181,36 @@ class PixelMotionFitter:
     def find(self, images, stars=None, *, max_motion=None,
              max_parallax=None, false_alarm=1e-5):
         """
-        Look for stars in the evidence of all images together.
+        Search all images together for stars.
 
         Parameters
         ----------
         images : sequence of `ImageEpoch`
-            As for `fit`; they lie on each other, to within their sizes.
+            As for `fit`; their fields must overlap.
         stars : `~astropy.table.Table` or SkyCoord, optional
-            Stars that are known, to be fitted and subtracted first. They are
+            Known stars, which are fitted and subtracted first. They are
             not in the result.
         max_motion : `~astropy.units.Quantity`, optional
-            The largest motion along each axis that is searched; by default
-            that of 0.1 pixels an epoch. Time grows with its square.
+            The largest motion along each axis to search for; by default
+            0.1 pixels per epoch. The time grows with its square.
         max_parallax : `~astropy.units.Quantity`, optional
-            The largest parallax that is searched, with ``parallax=True``;
-            by default none is. Parallaxes below half a pixel need no search.
+            The largest parallax to search for, with ``parallax=True``; by
+            default zero. Parallaxes below half a pixel need no search.
         false_alarm : float, optional
-            How often noise may be taken for a star, at each independent
-            place.
+            The probability at each independent place that noise counts as
+            a star.
 
         Returns
         -------
         `~astropy.table.QTable`
             ``id``, ``ra``, ``dec``, ``pmra``, ``pmdec``, the other columns
             of a fit of the stars, and ``evidence``, the signal-to-noise
-            ratio of the search; what `fit` takes as ``stars``.
+            ratio of the search. Give it to `fit` as ``stars``.
 
         Raises
         ------
         TypeError, ValueError
-            If an argument is not valid, or images do not lie on each other.
+            If an argument is not valid, or the images do not overlap.
         """
         self._check()
         as_real(false_alarm, 'false_alarm', above=0, maximum=0.5)

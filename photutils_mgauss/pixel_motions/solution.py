@@ -34,11 +34,11 @@ class PixelMotionSolution:
         ``reduced_chi2``, and ``significance``, the signal-to-noise ratio of
         all images together.
     images : `~astropy.table.QTable`
-        One row per image: how many stars it shows, and its ``shift`` [pix]
-        from where its WCS and the other images put the stars.
+        One row per image: the number of stars in it, and its ``shift``
+        [pix] relative to the positions from its WCS and the other images.
     notes : tuple of str
-        What speaks against the images, in sentences; each is a warning of
-        the fit, too.
+        Sentences about problems of the images; the fit also gives each as
+        a warning.
 
     Examples
     --------
@@ -122,25 +122,26 @@ class PixelMotionSolution:
 
     def cutouts(self, star=None, *, size=15):
         """
-        Return what each image shows of one star.
+        Return cutouts of one star from all images.
 
         Parameters
         ----------
         star : optional
-            Its ``id``; by default that of the star of the least
-            ``significance`` without a flag, other than that motions are
-            relative.
+            Its ``id``; by default the star with the smallest
+            ``significance`` among those without a flag, except the flag
+            for relative motions.
         size : int or (ny, nx) tuple of int, optional
-            Of the stamps.
+            The shape of the stamps.
 
         Returns
         -------
         `~astropy.table.QTable`
-            One row for each image that shows it: ``image``, ``time``, ``x``,
-            ``y``, and (ny, nx) stamps with the star in the middle pixel:
-            ``data`` less the sky, ``model`` of all stars and ``residual``.
-            NaN where there is no pixel. Its ``meta`` has the ``ID`` and the
-            ``SIGNIF`` of the star. Without any star there are no rows.
+            One row for each image that shows it: ``image``, ``time``,
+            ``x``, ``y``, and (ny, nx) stamps with the star in the middle
+            pixel: ``data`` less the sky, ``model`` of all stars and
+            ``residual``. NaN outside of the image. Its ``meta`` has the
+            ``ID`` and the ``SIGNIF`` of the star. Without any star there
+            are no rows.
 
         Raises
         ------

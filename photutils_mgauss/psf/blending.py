@@ -9,7 +9,7 @@ __all__ = ['blend']
 
 def blend(mixtures, fractions):
     """
-    Mix M mixtures into one (Sec. 3.3: 4 neighbours of 3 make 12 Gaussians).
+    Blend M mixtures into one, as a grid does between its nodes (Sec. 3.3).
 
     Parameters
     ----------

@@ -64,10 +64,10 @@ class GriddedMixturePSF(GridConversions, PSFModel):
     """
     A PSF that varies over a detector: mixtures of Gaussians on a grid.
 
-    Used wherever photutils takes a PSF model, such as
-    `photutils.psf.PSFPhotometry`, in place of
-    `photutils.psf.GriddedPSFModel`. Its parameters are ``flux``, ``x_0`` and
-    ``y_0``.
+    Use it wherever photutils takes a PSF model, for example in
+    `photutils.psf.PSFPhotometry`, instead of
+    `photutils.psf.GriddedPSFModel`. Its parameters are ``flux``, ``x_0``
+    and ``y_0``.
 
     Parameters
     ----------
@@ -84,29 +84,29 @@ class GriddedMixturePSF(GridConversions, PSFModel):
     x_0, y_0 : float, optional
         The position of the star [pix].
     pixel_integrated : bool, optional
-        Whether to integrate the mixtures over each unit pixel. Leave it off
-        if they already contain the pixel, as those made from ePSFs do.
+        Whether to integrate the mixtures over each unit pixel. Leave it
+        off if they already include the pixel, as those made from ePSFs do.
     scales : (N,) array_like, optional
         The flux on the detector of a star of ``flux`` 1 at each node; 1 by
-        default. Grids made from ePSFs keep the scale of those, so that
-        fluxes agree with the ones `~photutils.psf.GriddedPSFModel` gives.
+        default. Grids made from ePSFs keep the scale of the ePSFs, so that
+        fluxes agree with those of `~photutils.psf.GriddedPSFModel`.
     interpolation : {'blend', 'components'}, optional
-        How to go from node to node: ``'blend'`` adds the images of four
-        neighbours, 4 K Gaussians; ``'components'`` pairs the Gaussians of
-        neighbours and blends each pair into one, K Gaussians with the same
-        flux, centroid and second moments.
+        The interpolation between nodes: ``'blend'`` adds the images of the
+        four nearest nodes, with 4 K Gaussians; ``'components'`` matches
+        the Gaussians of these nodes and replaces each set by one Gaussian
+        with the same flux, centroid and second moments, with K Gaussians.
     outside : {'clamp', 'raise', 'nan'}, optional
-        What a star outside the outermost nodes gets: the PSF of the nearest
-        edge, a ValueError, or NaN. Leave it at ``'clamp'`` for fits, which
-        may step anywhere.
+        The PSF of a star outside the outermost nodes: that of the nearest
+        edge, a ValueError, or NaN. Use ``'clamp'`` for fits, because a fit
+        may step outside.
     errors : PSFErrors, optional
-        How far the PSF may be off, as ``MixtureField.psf_errors`` knows it.
-        Photometry adds it to the errors of stars.
+        The errors of the PSF, from ``MixtureField.psf_errors``. Photometry
+        adds their effect to the errors of stars.
     contexts : sequence of PSFContext, optional
-        How the PSF changes with the colour or the flux of a star, as
-        ``MixtureField.to_grid`` knows it. The grid itself is the PSF of usual
-        stars, and so are its values; `MixturePSFPhotometry` fits each star
-        with the PSF of its own.
+        The change of the PSF with the colour or the flux of a star, from
+        ``MixtureField.to_grid``. The grid itself, and its values, are for
+        a typical star; `MixturePSFPhotometry` fits each star with its own
+        PSF.
     **kwargs
         Keywords of `~astropy.modeling.Model`: ``name``, ``meta``, ``fixed``,
         ``bounds``.
@@ -194,9 +194,9 @@ n_components=1)>
         dR^2/R^2 and d-epsilon of Eq. 8 by adaptive moments, and ``e1``,
         ``e2`` of the image; ``phase_error``, half the range of the shift
         with pixel phase that the residual causes [pix];
-        ``flux_phase_error``, the standard deviation over the pixel phases of
-        a flux fitted in 5 x 5 pixels, as a fraction of it, that of faint or
-        of bright stars, whichever is greater; ``enclosed_flux``;
+        ``flux_phase_error``, the standard deviation over the pixel phases
+        of a flux fitted in 5 x 5 pixels, as a fraction of it, for faint or
+        for bright stars, whichever is larger; ``enclosed_flux``;
         ``bridged``, whether the node was filled from its neighbours;
         ``status`` and ``message`` of the fit, -1 for mixtures not fitted.
         """
@@ -234,17 +234,17 @@ n_components=1)>
 
     @property
     def errors(self):
-        """How far the PSF may be off, or None if that is not known."""
+        """The errors of the PSF, or None if they are not known."""
         return self._errors
 
     @property
     def contexts(self):
-        """How the PSF changes with colours and fluxes, a tuple."""
+        """The changes of the PSF with colours and fluxes, a tuple."""
         return self._contexts
 
     @property
     def interpolation(self):
-        """How neighbouring nodes are put together."""
+        """The interpolation between nodes, 'blend' or 'components'."""
         return self._interpolation
 
     @property
@@ -389,7 +389,8 @@ n_components=1)>
         Returns
         -------
         GaussianMixture
-            Of unit flux and up to 4 K Gaussians, or K for matched ones.
+            A mixture of unit flux with up to 4 K Gaussians, or K with the
+            interpolation 'components'.
 
         Raises
         ------
@@ -433,17 +434,18 @@ n_components=1)>
 
     def at_context(self, **values):
         """
-        Return the grid of stars of a colour, or of another context.
+        Return the grid for stars of one colour, or of another context.
 
         Parameters
         ----------
         **values : float
-            For names of ``contexts``; others stay what they are.
+            Values by the names of ``contexts``; other contexts stay
+            unchanged.
 
         Returns
         -------
         GriddedMixturePSF
-            Its mixtures are blends of those that are known.
+            A grid whose mixtures are blends of those of this one.
 
         Raises
         ------
@@ -463,7 +465,7 @@ n_components=1)>
 
     def local_model(self, x, y):
         """
-        Return the PSF at a detector position as a model of its own.
+        Return the PSF at a detector position as a separate model.
 
         Parameters
         ----------
@@ -473,7 +475,7 @@ n_components=1)>
         Returns
         -------
         MultiGaussianPSFModel
-            At (x, y), its flux that of a star of flux 1.
+            A model at (x, y), with the flux of a star of flux 1.
         """
         return MultiGaussianPSFModel(
             self.mixture_at(x, y), flux=self.scale_at(x, y), x_0=x, y_0=y,

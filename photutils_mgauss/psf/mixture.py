@@ -263,7 +263,7 @@ class GaussianMixture(ComparedByValue):
         Parameters
         ----------
         x, y, pixel_integrated
-            As for `evaluate`; what is differentiated is what it returns.
+            As for `evaluate`, whose result is differentiated.
 
         Returns
         -------
@@ -357,8 +357,8 @@ class GaussianMixture(ComparedByValue):
         Return the flux within a radius of the star.
 
         In polar coordinates the integral over radius is a closed form; the
-        one over angle is periodic and summed with equal steps, whose number
-        grows until nothing changes beyond 1e-10.
+        one over angle is periodic and summed with equal steps, whose
+        number grows until the result changes by less than 1e-10.
 
         Parameters
         ----------
@@ -449,8 +449,8 @@ class GaussianMixture(ComparedByValue):
         Raises
         ------
         ValueError
-            If a component is narrower than the Gaussian, so that what is
-            left is not positive definite.
+            If a component is narrower than the Gaussian, so that the rest
+            is not positive definite.
 
         Examples
         --------

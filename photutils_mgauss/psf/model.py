@@ -55,31 +55,32 @@ class MultiGaussianPSFModel(PSFModel):
         M(x, y) = F \sum_k \omega_k\, G(x - x_0, y - y_0 \,|\,
         \alpha_k, \beta_k, \gamma_k)
 
-    with G of Eq. 3 of Nie et al. Used wherever astropy takes a
-    `~astropy.modeling.Fittable2DModel` or photutils a PSF model.
+    with G of Eq. 3 of Nie et al. Use it wherever astropy takes a
+    `~astropy.modeling.Fittable2DModel` or photutils takes a PSF model.
 
     The parameters are scalars, in this order: ``flux``, ``x_0``, ``y_0``;
     ``fraction_1`` to ``fraction_{K-1}`` (stick-breaking fractions of the
-    weights, any value in (0, 1) is valid); ``x_mean_k``, ``y_mean_k``,
-    ``x_stddev_k``, ``y_stddev_k``, ``rho_k`` for k = 1 to K [pix]. All but
-    the first three are fixed by default, see `free_shape`.
+    weights; any value in (0, 1) is valid); ``x_mean_k``, ``y_mean_k``,
+    ``x_stddev_k``, ``y_stddev_k``, ``rho_k`` for k = 1 to K [pix]. By
+    default all parameters except the first three are fixed; see
+    `free_shape`.
 
     Parameters
     ----------
     mixture : GaussianMixture, optional
-        The shape of the PSF. ``None`` makes ``n_components`` concentric round
-        Gaussians to start a fit from.
+        The shape of the PSF. With ``None`` it is ``n_components``
+        concentric round Gaussians, as a start for a fit.
     n_components : int, optional
-        The number K of Gaussians where no mixture is given.
+        The number K of Gaussians if no mixture is given.
     flux : float or `~astropy.units.Quantity`, optional
         The total flux.
     x_0, y_0 : float, optional
         The position of the star, which is the origin of the mixture's means
         [pix].
     pixel_integrated : bool, optional
-        Whether the model integrates the mixture over each unit pixel. Leave
-        it off if the mixture already contains the pixel, as those made from
-        ePSFs, PSFEx models or star images do.
+        Whether the model integrates the mixture over each unit pixel.
+        Leave it off if the mixture already includes the pixel, as mixtures
+        made from ePSFs, PSFEx models or images of stars do.
     **kwargs
         Values of the shape parameters and the keywords of
         `~astropy.modeling.Model`: ``name``, ``meta``, ``fixed``, ``bounds``.
@@ -205,10 +206,11 @@ class MultiGaussianPSFModel(PSFModel):
 
     def free_shape(self):
         """
-        Return a copy whose shape is free, but for the first Gaussian's mean.
+        Return a copy with a free shape, except the first Gaussian's mean.
 
-        That mean stays fixed because a common shift of all means cannot be
-        told from ``x_0`` and ``y_0``: fits of both run away.
+        This mean stays fixed because a common shift of all means has the
+        same effect as ``x_0`` and ``y_0``: a fit of both does not
+        converge.
 
         Returns
         -------
@@ -295,9 +297,9 @@ class MultiGaussianPSFModel(PSFModel):
         Returns
         -------
         list of `~numpy.ndarray`
-            One array of the shape of x for each parameter, with what is tied
-            to it. Those of fixed parameters, which no fit uses, are zero and
-            not computed.
+            One array of the shape of x for each parameter, with what is
+            tied to it. The derivatives by fixed parameters, which no fit
+            uses, are set to zero and not computed.
         """
         free = [bool(not parameter.fixed or parameter.tied) for parameter in
                 (getattr(self, name) for name in self.param_names)]
