@@ -25,9 +25,9 @@ def add_options(parser):
                             'exposure, and so are catalogues that were '
                             'measured in images of one file')
     group.add_argument('--distortion', metavar='KIND', type=tools.transform,
-                       help='with --chips: what a chip may differ by from '
-                            'its WCS, the same in all exposures: none, '
-                            'affine, poly-2, poly-3, ... (default: affine)')
+                       help='with --chips: how chips may differ from their '
+                            'WCS, the same in all exposures: none, affine, '
+                            'poly-2, poly-3, ... (default: affine)')
 
 
 def check(options):

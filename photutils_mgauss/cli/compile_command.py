@@ -13,10 +13,10 @@ def add(commands):
     """Add the command to the parser's."""
     tools.command(
         commands, 'compile', 'compile all fits once, before they are needed',
-        'Compile everything that the package would compile at the first call '
-        'of each kind, and keep it: for the image of a container, for the '
-        'workers of a cluster that share a folder (NUMBA_CACHE_DIR), or to '
-        'wait now rather than later.', 'mgauss compile', run)
+        'Compile all loops that the package would otherwise compile at the '
+        'first call of each kind, and keep them. Use it when you build a '
+        'container, or for the workers of a cluster that share a folder '
+        '(NUMBA_CACHE_DIR).', 'mgauss compile', run)
 
 
 def run(options):

@@ -22,9 +22,8 @@ def add(commands):
     demo.add_argument('--seed', type=int, default=1,
                       help='of the simulation (default: %(default)s)')
     demo.add_argument('--images-only', action='store_true',
-                      help='write the images, as FITS, and the quasars, and '
-                           'measure nothing: something to try the other '
-                           'commands on')
+                      help='only write the images, as FITS, and the quasars, '
+                           'for trying the other commands')
     tools.add_overwrite(demo)
 
 

@@ -56,14 +56,14 @@ def _section(field, name, figures):
     if pulls.size:
         panels.append(Panel(
             lambda ax: plotting.plot_pulls(pulls, ax=ax),
-            'The same of references (of all stars, if there are none), in '
-            'their errors, along both axes; the line is what right errors '
-            'would give.'))
+            'Residuals of references (of all stars, if there are none) in '
+            'units of their errors, along both axes; the line is for correct '
+            'errors.'))
     return Section(f'{name} in its field: {field.folder}', facts=facts,
                    panels=tuple(panels), verdict=_verdict(figures),
-                   text='Completeness is the share that this exposure shows '
-                        'of the stars that two other exposures show, or the '
-                        'only other one.')
+                   text='Completeness: of the stars that two other exposures '
+                        'show (or the only other one), the share that this '
+                        'exposure shows.')
 
 
 def _words(name, unit):

@@ -26,9 +26,9 @@ def add(commands):
     """Add the command to the parser's."""
     parser = tools.command(
         commands, 'info', 'what a file is, and how it would be read',
-        'Say of each file whether it is an image, a PSF or a table, and what '
-        'the other commands would take from it: noise, bad pixels, WCS and '
-        'time of an image, nodes of a PSF, columns of a table.',
+        'Print for each file whether it is an image, a PSF or a table, and '
+        'what the other commands would read from it: noise, bad pixels, WCS '
+        'and time of an image, nodes of a PSF, columns of a table.',
         'mgauss info night1.fits night1_psf.fits night1_cat.ecsv', run)
     tools.add_inputs(parser, 'FILE', 'images, PSFs or tables')
     parser.add_argument('--detector', metavar='NUMBER',

@@ -35,12 +35,12 @@ def add(commands):
     """Add the command to the parser's."""
     parser = tools.command(
         commands, 'motions', 'proper motions and corrected WCS',
-        'Match the stars of two or more exposures, or of one and a '
-        'catalogue like that of Gaia, align the exposures on '
-        'objects of known motion, and fit proper motions. Inputs are '
-        'catalogues, of mgauss photometry or with ra, dec and their errors, '
-        'or images, which are measured first. Without references the '
-        'motions are relative to the mean of the stars.',
+        'Match the stars of two or more exposures, or of one and a catalogue '
+        'like that of Gaia, align the exposures on objects with known '
+        'motions, and fit proper motions. Inputs are catalogues, of mgauss '
+        'photometry or with ra, dec and their errors, or images, which are '
+        'measured first. Without references the motions are relative to the '
+        'mean of the stars.',
         'mgauss motions night1_cat.ecsv night2_cat.ecsv '
         '--references quasars.ecsv', run)
     tools.add_inputs(parser, 'FILE', 'a catalogue or an image of each '
@@ -64,17 +64,17 @@ def add(commands):
 def _add_solution(parser):
     group = parser.add_argument_group('the motions')
     group.add_argument('--references', metavar='TABLE',
-                       help='objects of known motion: ra, dec and class (qso, '
-                            'galaxy, star, position), or a table of Gaia')
+                       help='objects with known motions: ra, dec and class '
+                            '(qso, galaxy, star, position), or a table of '
+                            'Gaia')
     group.add_argument('--reference-class', metavar='CLASS',
                        choices=('qso', 'galaxy', 'star', 'position'),
-                       help='class of all references, for tables without '
-                            'that column')
+                       help='class of all references, for tables without a '
+                            'column class')
     group.add_argument('--transform', metavar='KIND', type=tools.transform,
-                       help='what may differ between exposures: none, '
+                       help='how the frames of exposures may differ: none, '
                             'shift, rigid, similarity, affine, poly-2, ... '
-                            '(default: %(default)s, or none with '
-                            '--parallax-of)')
+                            '(default: affine, or none with --parallax-of)')
     group.add_argument('--recipe', choices=('joint', 'two-step', 'paper'),
                        default='joint', help='default: %(default)s')
     group.add_argument('--parallax', action='store_true',
@@ -82,22 +82,20 @@ def _add_solution(parser):
     group.add_argument('--parallax-of', metavar='TABLE',
                        help='fit only the parallaxes of the objects in a '
                             'table, with id, ra, dec, pmra, pmdec, ref_epoch '
-                            '(and errors), and a rough parallax, by which '
-                            'they are found')
+                            '(and errors), and a rough parallax to find them')
     group.add_argument('--systematic', type=_systematic, metavar='MAS',
-                       help='error of each exposure to be added to those of '
+                       help='error of each exposure, added to the errors of '
                             'its stars (default: fitted); magnitude also '
-                            'fits how wrong the errors of stars are, as a '
-                            'function of magnitude')
+                            'corrects the errors of stars as a function of '
+                            'magnitude')
     group.add_argument('--terms', nargs='+', default=[],
                        choices=('magnitude', 'colour', 'y'),
-                       help='what stars of an exposure may be displaced by, '
-                            'besides their place; used where it predicts '
-                            'stars that were left out')
+                       help='fit displacements that depend on these; used if '
+                            'they predict stars that were left out of the fit')
     group.add_argument('--observer', metavar='NAME',
-                       help='from where parallaxes are seen: earth, leo, l2, '
-                            'or a table of barycentric places x, y, z [au], '
-                            'one for each exposure or with their times')
+                       help='place of the observer, for parallaxes: earth, '
+                            'leo, l2, or a table of barycentric positions x, '
+                            'y, z [au], one for each exposure or with times')
     group.add_argument('--max-motion', type=tools.positive, default=50,
                        metavar='MAS/YR', help='largest motion considered in '
                        'matching (default: %(default)s)')
@@ -110,10 +108,10 @@ def _add_solution(parser):
                             'that are turned or mirrored '
                             '(default: %(default)s)')
     group.add_argument('--good-flags', type=tools.not_negative,
-                       default=0, metavar='BITS', help='sum of the flags of '
-                       'detections to be used all the same')
+                       default=0, metavar='BITS', help='sum of the flags '
+                       'that do not exclude a detection')
     group.add_argument('--plane', action='store_true',
-                       help='take pixels for coordinates, without WCS')
+                       help='use pixels as coordinates, without a WCS')
 
 
 def _systematic(text):

@@ -37,8 +37,9 @@ def add(commands):
     tools.add_inputs(parser, 'IMAGE', 'images')
     parser.add_argument('--psf', nargs='+', default=[], metavar='FILE',
                         help='PSF of all images, or one for each: a file of '
-                             'mgauss psf, or any it could read (default with '
-                             '--crowded: made of the stars of each image)')
+                             'mgauss psf, or any PSF file that it reads '
+                             '(default with --crowded: made from the stars '
+                             'of each image)')
     parser.add_argument('--output', metavar='NAME',
                         help='folder, or for a single image a file: .ecsv or '
                              '.fits (default: IMAGE_cat.ecsv)')
@@ -62,9 +63,9 @@ def add_measuring(parser):
                        metavar='PIXELS', help='side of the fitted region, '
                        'odd (default: %(default)s)')
     group.add_argument('--residual-radius', type=tools.positive,
-                       metavar='PIXELS', help='measure what the PSF leaves '
-                       'of bright stars, such as spikes, out to here, and '
-                       'take it off them')
+                       metavar='PIXELS', help='measure the residual of '
+                       'bright stars, such as spikes, out to this distance, '
+                       'and subtract it from them')
     group.add_argument('--magnitudes', action='store_true',
                        help='add AB magnitudes; for images in MJy/sr or a '
                             'unit of flux density')

@@ -24,27 +24,27 @@ def add_options(parser):
                             'together; takes --psf. With --crowded all '
                             'stars and the sky are fitted together')
     group.add_argument('--psf', nargs='+', default=[], metavar='FILE',
-                       help='with --pixels: the PSF of all images, or one of '
-                            'each (default with --crowded: made of the stars '
-                            'of each image)')
+                       help='with --pixels: the PSF of all images, or one '
+                            'for each (default with --crowded: made from the '
+                            'stars of each image)')
     group.add_argument('--band', nargs='+', metavar='NAME',
                        help='with --pixels: the filter of all images, or of '
                             'each, if they differ: stars have one flux or '
                             'similar ones in images of a filter')
     group.add_argument('--frames', metavar='FOLDER',
-                       help='with --pixels: what mgauss motions wrote of '
-                            'these exposures before, for the corrected WCS '
-                            'and what their errors add to those of stars '
-                            '(default: the WCS of the images, without error)')
+                       help='with --pixels: the output of mgauss motions for '
+                            'these exposures, for the corrected WCS and '
+                            'their errors (default: the WCS of the images, '
+                            'without errors)')
     group.add_argument('--targets', metavar='TABLE',
                        help='with --pixels: ra and dec of the stars '
                             '(default: those found in all images together)')
     group.add_argument('--forced', action='store_true',
-                       help='with --targets: fit fluxes only, at the places '
-                            'and motions of the table')
+                       help='with --targets: fit only fluxes, at the '
+                            'positions and motions of the table')
     group.add_argument('--refine-frames', action='store_true',
-                       help='with --pixels: find the frames of the images '
-                            'from the pixels of bright stars, too')
+                       help='with --pixels: also fit the frames of the '
+                            'images, to the pixels of bright stars')
 
 
 def check_alone(options):

@@ -24,7 +24,8 @@ def add(commands):
     """Add the command to the parser's."""
     parser = tools.command(
         commands, 'psf', "make a PSF of an image's own stars, or of a PSF "
-        'file', 'Make a grid of Gaussian mixtures for each input. Of an '
+        'file', 'Make a PSF, a grid of Gaussian mixtures, for each input. Of '
+                'an '
         "image, it is made of the image's own stars; PSFEx models, STDPSF "
         'and STPSF grids and ePSFs (images with the keyword OVERSAMP) are '
         'fitted.', 'mgauss psf night1.fits night2.fits --output psfs',
@@ -48,37 +49,38 @@ def add_fit(parser):
     """Add the options of the fit to an image's own stars; return them."""
     group = parser.add_argument_group('the fit')
     group.add_argument('--n-components', type=tools.number_or_auto,
-                       metavar='K', help='number of Gaussians, or auto, '
-                       'which tries (default: 6 for images, auto with 8 to '
-                       '59 stars; 3 for PSF files)')
+                       metavar='K', help='number of Gaussians, or auto to '
+                       'choose it (default: 6 for images, auto with 8 to 59 '
+                       'stars; 3 for PSF files)')
     group.add_argument('--degree', type=tools.number_or_auto, metavar='D',
                        help='degree of the polynomials over the detector, or '
                             'auto (default: 4, auto with 8 to 59 stars)')
     group.add_argument('--radius', type=tools.positive, metavar='PIXELS',
                        help='radius of the stamps (default: 10 for images)')
     group.add_argument('--min-snr', type=tools.positive, default=50,
-                       metavar='SNR', help='least signal-to-noise ratio of '
-                       'the stars (default: %(default)s)')
+                       metavar='SNR', help='smallest signal-to-noise ratio '
+                       'of the stars (default: %(default)s)')
     group.add_argument('--max-stars', type=tools.count, default=400,
                        metavar='N', help='largest number of stars (default: '
                        '%(default)s)')
     group.add_argument('--stars', metavar='TABLE',
-                       help='table with x, y of the stars to look at, '
+                       help='table with x, y of the stars to consider, '
                             'instead of detection')
     group.add_argument('--start', metavar='PSF',
-                       help='a PSF file, as from an archive, that the stars '
-                            'change: fifteen are enough (with a degree of '
-                            '1 by default, and its Gaussians)')
+                       help='a known PSF, for example from an archive, to '
+                            'adjust to the stars; fifteen stars are enough '
+                            '(default degree: 1)')
     return group
 
 
 def _add_files(parser):
     group = parser.add_argument_group('PSF files')
     group.add_argument('--detector', metavar='NUMBER',
-                       help='detector of an STDPSF file of several; for '
+                       help='detector in an STDPSF file with several; for '
                             'other files with several PSFs use --ext')
     group.add_argument('--oversampling', type=tools.count, metavar='N',
-                       help='of an ePSF image without OVERSAMP')
+                       help='samples per pixel of an ePSF image without '
+                            'OVERSAMP')
 
 
 def run(options):

@@ -16,9 +16,9 @@ from photutils_mgauss.cli.results import Results, file_marks
 def add_option(group):
     """Add the option to those of the fit."""
     group.add_argument('--together', action='store_true',
-                       help='one fit for the stars of all images, exposures '
-                            'of one detector; their PSFs differ by a width '
-                            'of each. All images are in memory')
+                       help='one fit for the stars of all images, which are '
+                            'exposures of one detector; each PSF has its own '
+                            'width. All images are in memory')
 
 
 def run(options):

@@ -11,7 +11,7 @@ def add(commands):
     parser = tools.command(
         commands, 'report', 'figures and a page of HTML of results',
         'Show PSFs, catalogues and proper motions on one page of HTML, which '
-        'has its figures inside and needs no other file.',
+        'contains its figures and needs no other file.',
         'mgauss report night1_psf.fits night1_cat.ecsv mgauss_motions '
         '--output report.html', run)
     tools.add_inputs(parser, 'PATH',
@@ -21,9 +21,9 @@ def add(commands):
     parser.add_argument('--title', default='Positions and proper motions',
                         help='of the page (default: %(default)s)')
     parser.add_argument('--field', metavar='FOLDER',
-                        help='output of mgauss motions, to say how each '
-                             'catalogue compares with the other exposures '
-                             'of its field')
+                        help='output of mgauss motions; adds a comparison of '
+                             'each catalogue with the other exposures of its '
+                             'field')
     tools.add_overwrite(parser)
 
 

@@ -16,8 +16,8 @@ from photutils_mgauss.cli import tools
 def add_checkpoint(parser):
     """Add the option for the folder."""
     parser.add_argument('--checkpoint', metavar='FOLDER',
-                        help='keep what is finished in a folder; the same '
-                             'command goes on where it was stopped')
+                        help='keep finished results in a folder; if the '
+                             'command is stopped, give it again to continue')
 
 
 def add_dry_run(parser):

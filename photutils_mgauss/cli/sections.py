@@ -34,7 +34,7 @@ def psf_section(path):
              'Gaussians at a node': psf.n_components,
              'FWHM, median [pix]': f'{np.median(fwhm):.3f}',
              'Ellipticity, median': f'{np.median(shapes.ellipticity):.3f}'}
-    for name, words in (('n_stars', 'Stars it was made of'),
+    for name, words in (('n_stars', 'Stars used for the PSF'),
                         ('degree', 'Degree over the detector'),
                         ('accuracy', 'Relative error left')):
         if record.get(name):
@@ -44,8 +44,8 @@ def psf_section(path):
                     'The PSF in the middle of the detector.'),
               Panel(lambda ax: plotting.plot_radial_profile(psf, *middle,
                                                             ax=ax),
-                    'The same against the distance from the centre; the '
-                    'band spans all directions.')]
+                    'The PSF against the distance from the centre; the band '
+                    'covers all directions.')]
     if len(psf.grid_xypos) > 1:
         panels += _maps(psf, record.get('stars'))
     return Section(f'PSF: {path}', verdict=_psf_verdict(fwhm, record),
@@ -75,8 +75,7 @@ def _maps(psf, stars):
     if np.isfinite(np.asarray(psf.report['size_error'], float)).any():
         panels.append(Panel(
             lambda ax: plotting.plot_node_map(psf, 'size_error', ax=ax),
-            'How much larger the images were than the mixtures fitted to '
-            'them.'))
+            'Size of the images relative to the mixtures fitted to them.'))
     return panels
 
 
@@ -110,7 +109,7 @@ def _star_verdict(table, good):
     right = _RIGHT[0] < chi2 < _RIGHT[1]
     return Verdict(bool(good.mean() > 0.5 and right), f'{words}; their '
                    f'median reduced chi2 is {chi2:.2f} (1 if the PSF and the '
-                   'errors of pixels are right)')
+                   'errors of pixels are correct)')
 
 
 def _star_facts(table, good):
@@ -120,7 +119,7 @@ def _star_facts(table, good):
     bright = flux >= np.nanpercentile(flux[good], 90) if good.any() else good
     return {'Stars': len(table), 'Without flags': int(good.sum()),
             'Median error of x [pix]': f'{np.nanmedian(error[good]):.4f}',
-            'That of the brightest tenth [pix]':
+            'Median error of x of the brightest tenth [pix]':
                 f'{np.nanmedian(error[bright & good]):.4f}'}
 
 
@@ -137,7 +136,7 @@ def _star_panels(table, good, seen):
     panels = [
         Panel(lambda ax: plotting.plot_detections(
             x, y, flux, data=seen.data if seen and seen.whole else None,
-            ax=ax), 'The stars, brighter ones larger.'),
+            ax=ax), 'The stars; larger symbols are brighter.'),
         Panel(lambda ax: plotting.plot_stated_errors(
             magnitude[good], errors, unit='pix', label=label, ax=ax),
             'Errors of position against magnitude, of stars without flags.')]
@@ -145,8 +144,7 @@ def _star_panels(table, good, seen):
         chi2 = {'reduced chi2': column_values(table, 'reduced_chi2')[good]}
         panels.append(Panel(
             lambda ax: _chi2(ax, magnitude[good], chi2, label),
-            'How well the PSF describes the stars: 1 if noise is all that '
-            'is left.'))
+            'Reduced chi2 of the stars: 1 if the residuals are only noise.'))
     if seen is not None and not seen.whole:
         (x0, y0), (ny, nx) = seen.corner, seen.data.shape
         near = (x >= x0) & (x < x0 + nx) & (y >= y0) & (y < y0 + ny)
@@ -160,7 +158,7 @@ def _star_panels(table, good, seen):
         panels.append(Panel(
             lambda ax: plotting.plot_residual_image(seen.residual, seen.error,
                                                     ax=ax),
-            f'What the stars leave of {what}, in standard errors.'))
+            f'Residuals of {what}, in standard errors.'))
     return panels
 
 
@@ -214,8 +212,8 @@ def _motion_verdict(table, solved, free):
     uwe = column_values(table, 'uwe')[solved & free]
     uwe = uwe[np.isfinite(uwe) & (uwe > 0)]
     if not uwe.size:
-        return Verdict(bool(solved.mean() > 0.5), f'{words}; two epochs leave '
-                       'nothing to judge their errors by')
+        return Verdict(bool(solved.mean() > 0.5), f'{words}; with two epochs '
+                       'the data cannot test their errors')
     middle = float(np.median(uwe))
     return Verdict(
         bool(solved.mean() > 0.5 and _RIGHT[0] < middle < _RIGHT[1]),
@@ -254,8 +252,8 @@ def _motion_panels(table, solved, free):
     if 'dpmra' in table.colnames:
         panels.append(Panel(
             lambda ax: plotting.plot_reference_differences(table, ax=ax),
-            'The motions of references as the exposures alone have them, '
-            'minus those of their catalogue.'))
+            'The motions of references, measured from the exposures alone, '
+            'minus those of the catalogue.'))
     # The motions of references are what a catalogue says.
     stars = table[solved & free]
     with np.errstate(invalid='ignore', divide='ignore'):
@@ -281,11 +279,11 @@ def cutout_section(path, table, record):
         facts |= {'Star': table.meta['ID'], 'Signal to noise in all images':
                   f'{table.meta["SIGNIF"]:.1f}'}
     panels = (Panel(lambda ax: plotting.plot_cutouts(table, ax=ax),
-                    'Each image, what the fit makes of it, and the rest.'),
+                    'Image, model and residual for each exposure.'),
               ) if len(table) else ()
     return Section(f'A faint star: {path}', facts=facts, panels=panels,
-                   text='The faintest star with a motion, as all images show '
-                        'it.', record=record)
+                   text='The faintest star with a motion, in all images.',
+                   record=record)
 
 
 def alignment_section(path, table, record):
@@ -307,8 +305,9 @@ def alignment_section(path, table, record):
         rows.append(line)
     return Section(f'Alignment: {path}', rows=rows, record=record,
                    verdict=_alignment_verdict(table, names),
-                   text='What the frame of each exposure was shifted by, in '
-                        'the middle of the field, and how well it fits.')
+                   text='The shift of the frame of each exposure in the '
+                        'middle of the field, and the residuals of its '
+                        'references.')
 
 
 def _names_of_epochs(record):

@@ -12,23 +12,23 @@ from photutils_mgauss.utils.parallel import watched
 from photutils_mgauss.utils.waiting import waiting
 
 _EXAMPLE = """\
-# What mgauss survey does. Names are relative to the folder of this file.
+# The settings of mgauss survey. Names are relative to the folder of this file.
 output = "survey"
 # pages = false            # no page of figures for each exposure
 
 [exposures]
 files = {files}
 {ext}ext = "{name}"             # of files with several images: all with it
-{detector}detector = "DETECTOR"   # keyword that tells detectors apart
-{filter}group_by = ["FILTER"]   # keywords whose values keep fields apart
-# overlap = 0.5           # share in common from which images are of one field
-# gain = 1.5              # and other options of how images are read
+{detector}detector = "DETECTOR"   # keyword that distinguishes detectors
+{filter}group_by = ["FILTER"]   # keywords whose values separate fields
+# overlap = 0.5           # smallest shared area of images of one field
+# gain = 1.5              # and other options for reading images
 
 # The options of mgauss psf, photometry and motions, with _ for -.
 [psf]
 # n_components = 6
 # degree = 3
-# start = "archive.fits"  # a PSF that the stars of each exposure change
+# start = "archive.fits"  # a PSF to adjust to the stars of each exposure
 
 [photometry]
 # psf = "detector"        # one fit for all exposures of a detector, or
@@ -58,11 +58,11 @@ def add(commands):
     parser = tools.command(
         commands, 'survey', 'exposures of many fields to motions, in one run',
         'Make the PSF of each exposure, measure its stars, and fit the '
-        'motions of each field, that is, of the exposures that overlap. What '
-        'is finished is not done again: a run that was stopped goes on.',
+        'motions of each field, that is, of exposures that overlap. A run '
+        'that was stopped continues: finished results are not repeated.',
         'mgauss survey --init raw && mgauss survey survey.toml', run)
     parser.add_argument('file', nargs='?', metavar='SURVEY.toml',
-                        help='what to do')
+                        help='the survey file')
     parser.add_argument('--init', metavar='FOLDER',
                         help='write an example for the images in a folder '
                              '(default: survey.toml)')

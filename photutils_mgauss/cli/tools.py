@@ -41,8 +41,7 @@ def command(commands, name, words, description, example, run):
     parser.add_argument('--quiet', action='store_true',
                         help='no progress bars and no messages')
     parser.add_argument('--log-file', metavar='FILE',
-                        help='file to which everything is added that is said, '
-                             'with times')
+                        help='append all messages to this file, with times')
     parser.set_defaults(run=run, parser=parser)
     return parser
 
@@ -68,10 +67,10 @@ def add_reading(parser):
     """Add the options that say how images are read."""
     group = parser.add_argument_group(
         'reading images', textwrap.fill(
-            'What is not given is taken from the files: their extensions SCI, '
-            'ERR and DQ, their headers, and files beside them with names in '
-            '_err, _wht or _flg. Options with FILE take one for all images '
-            'or one for each.', 76))
+            'By default these values are read from the files: from the '
+            'extensions SCI, ERR and DQ, the headers, and files beside them '
+            'with names in _err, _wht or _flg. Options with FILE take one '
+            'file for all images or one for each.', 76))
     group.add_argument('--ext', metavar='NAME',
                        help='extension with the image: 1, SCI or SCI,2')
     group.add_argument('--error-ext', metavar='NAME',

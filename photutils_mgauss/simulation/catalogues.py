@@ -16,6 +16,7 @@ from photutils_mgauss.utils.validation import (
     as_rng,
     as_shape,
 )
+from photutils_mgauss.utils.waiting import waiting
 
 # Stars of 16 to 26 mag per pixel: 5.4 million on a chip (Sec. 5).
 PAPER_DENSITY = 5.4e6 / (9216 * 9232)
@@ -90,6 +91,7 @@ def _cells(n, spacing):
     return (np.arange(count) - (count - 1) / 2) * spacing + (n - 1) / 2
 
 
+@waiting('crowded_field')
 def crowded_field(shape, *, density=PAPER_DENSITY, magnitudes=(16.0, 26.0),
                   margin=24, rng=0):
     r"""
@@ -168,6 +170,7 @@ def _draw(density, limits, uniform):
     return np.interp(uniform * cumulative[-1], cumulative, grid)
 
 
+@waiting('sky_field')
 def sky_field(n_stars=614, n_qsos=590, *, ra=NGP[0], dec=NGP[1], size=11.3,
               parallaxes=True, separation=0.0, magnitudes=None, rng=0):
     """

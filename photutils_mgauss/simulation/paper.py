@@ -22,6 +22,7 @@ from photutils_mgauss.utils.validation import (
     as_integer,
     as_shape,
 )
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['paper_scene']
 
@@ -35,6 +36,7 @@ _STARS = 614 / (614 + 590)
 _BULGE = (266.0, 5.0)
 
 
+@waiting('paper_scene')
 def paper_scene(field='ngp', shape=None, *, epoch=3, psf=None, effects=None,
                 rng=0, executor=None):
     """

@@ -134,9 +134,9 @@ def test_a_survey_ends_in_motions_and_runs_only_what_changed(survey, capsys):
         assert words in page
     assert 'href="pages/noise.html"' not in page
     own = (folder / 'pages' / 'north0.html').read_text()
-    # Its image and what is left of it, its PSF, its pulls.
-    for words in ('What the stars leave of the image', 'The PSF in the middle',
-                  'north0 in its field', 'in their errors, along both axes'):
+    # Its image and its residuals, its PSF, its pulls.
+    for words in ('Residuals of the image', 'The PSF in the middle',
+                  'north0 in its field', 'of their errors, along both axes'):
         assert words in own
     assert own.count('<h2>north0 in its field') == 1
     # Nothing changed, so nothing is done again but what failed.

@@ -8,6 +8,7 @@ from io import StringIO
 
 import pytest
 
+import photutils_mgauss as mg
 from photutils_mgauss.utils import waiting as module
 from photutils_mgauss.utils.parallel import map_parallel, tell, watched
 from photutils_mgauss.utils.waiting import patient, progress, waiting
@@ -164,3 +165,16 @@ def test_methods_of_other_packages_show_their_name(monkeypatch):
     assert Photometry().draw('Photometry.draw [', again=True)[1]
     assert Photometry.draw.__doc__ == 'Draw stars.'
     assert 'Photometry.draw [' in screen.getvalue()
+
+
+@pytest.mark.parametrize('call', [
+    lambda: mg.sky_field(500, 0, size=1.0, separation=0.5),
+    lambda: mg.crowded_field((2000, 2000)),
+    lambda: mg.paper_scene('bulge', (60, 60))],
+    ids=['sky_field', 'crowded_field', 'paper_scene'])
+def test_simulations_that_take_long_show_their_name(monkeypatch, call):
+    screen = terminal(monkeypatch)
+    monkeypatch.setattr(module, '_PATIENCE', 0.0)
+    call()
+    assert re.search(r'(sky_field|crowded_field|paper_scene) \[00:',
+                     screen.getvalue())
