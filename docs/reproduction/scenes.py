@@ -8,6 +8,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 from astropy.table import QTable
+from peers import psfex
 from photutils.background import Background2D
 from photutils.detection import DAOStarFinder
 from scipy.spatial import cKDTree
@@ -153,6 +154,12 @@ class Detector:
         return fit_mixture_field(
             self.clean, self.psf_stars, error=scene.error, mask=scene.mask,
             n_components=5, degree=self.run.settings.degree, radius=RADIUS)
+
+    @cached_property
+    def psfex(self):
+        """What PSFEx makes of the exposure, and the file that has it."""
+        path = self.run.folder / 'partial' / f'psfex_{self.number:02d}.psf'
+        return psfex(self.sparse, self.run.settings.degree, path), path
 
     @cached_property
     def models(self):
