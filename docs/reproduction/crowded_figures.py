@@ -11,7 +11,6 @@ from peers import (
     INSTALL,
     AbsentError,
     crowdsource,
-    psfex,
     sextractor,
     windowed,
 )
@@ -164,8 +163,7 @@ def from_sextractor(x, y, flux, crowd):
     """Return the centres of one of SExtractor's three modes."""
     path = None
     if x == 'XPSF_IMAGE':
-        path = (crowd.run.folder / 'partial' / 'sky_08.psf').resolve()
-        psfex(crowd.one.sparse, crowd.run.settings.degree, path)
+        path = crowd.one.psfex[1].resolve()
     found = crowd.sextractor(path)
     good = np.isfinite(found[x]) & (found[flux] > 0)
     found = found[good]

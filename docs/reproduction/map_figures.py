@@ -1,7 +1,7 @@
 """Size and ellipticity over the detectors: Figs. 4 to 7."""
 import numpy as np
 from astropy.table import QTable, vstack
-from peers import AbsentError, absent, psfex
+from peers import AbsentError, absent
 from scenes import detector, forget
 from settings import BANDS, TABLE_2_DETECTORS, place_of
 from store import Comparison, Figure, Group
@@ -69,9 +69,8 @@ def _pairs(run, one):
              'chain_truth': (one.chain, one.true_image, False)}
     # PSFEx takes longer than everything else together.
     if one.number in TABLE_2_DETECTORS:
-        path = run.folder / 'partial' / f'{one.number:02d}.psf'
         try:
-            model = psfex(one.sparse, run.settings.degree, path)
+            model, _ = one.psfex
         except AbsentError as error:
             run.skipped[f'PSFEx on detector {one.number}'] = str(error)
         else:

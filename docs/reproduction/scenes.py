@@ -8,6 +8,7 @@ import astropy.units as u
 import numpy as np
 from astropy.io import fits
 from astropy.table import QTable
+from peers import psfex
 from photutils.background import Background2D
 from photutils.detection import DAOStarFinder
 from scipy.spatial import cKDTree
@@ -109,18 +110,25 @@ class Detector:
             psf=self.light, effects=effects(), rng=200_000 + seed,
             instrument=Instrument(shape=self.shape)))
 
+    @cached_property
+    def clean(self):
+        """The image of that exposure without its background."""
+        # Minutes for a whole detector, and three fits need it.
+        return self.sparse.image - background_of(self.sparse).background
+
     def release(self):
-        """Free the memory of the exposure, two gigabytes of a whole one."""
+        """Free the memory of the exposure, 2.5 GB of a whole one."""
         if self.truth and np.prod(self.shape) > LARGE:
-            vars(self).pop('sparse', None)
+            for name in ('sparse', 'clean'):
+                vars(self).pop(name, None)
 
     @cached_property
     def psf_stars(self):
         """The stars that PSFs are made of, as `select_psf_stars` gives."""
         scene = self.sparse
         return select_psf_stars(
-            background_free(scene)[0], error=scene.error, mask=scene.mask,
-            radius=RADIUS, fwhm=1.8, saturation=7e4,
+            self.clean, error=scene.error, mask=scene.mask, radius=RADIUS,
+            fwhm=1.8, saturation=7e4,
             max_stars=self.run.settings.psf_stars)
 
     @cached_property
@@ -128,8 +136,8 @@ class Detector:
         """The empirical PSF, polynomials of pixels sampled twice."""
         scene = self.sparse
         return EmpiricalPSF.from_stars(
-            background_free(scene)[0], self.psf_stars, error=scene.error,
-            mask=scene.mask, degree=self.run.settings.degree, radius=RADIUS)
+            self.clean, self.psf_stars, error=scene.error, mask=scene.mask,
+            degree=self.run.settings.degree, radius=RADIUS)
 
     @cached_property
     def chain(self):
@@ -144,9 +152,14 @@ class Detector:
         """The package's model: five Gaussians, fitted to the stars."""
         scene = self.sparse
         return fit_mixture_field(
-            background_free(scene)[0], self.psf_stars, error=scene.error,
-            mask=scene.mask, n_components=5,
-            degree=self.run.settings.degree, radius=RADIUS)
+            self.clean, self.psf_stars, error=scene.error, mask=scene.mask,
+            n_components=5, degree=self.run.settings.degree, radius=RADIUS)
+
+    @cached_property
+    def psfex(self):
+        """What PSFEx makes of the exposure, and the file that has it."""
+        path = self.run.folder / 'partial' / f'psfex_{self.number:02d}.psf'
+        return psfex(self.sparse, self.run.settings.degree, path), path
 
     @cached_property
     def models(self):
@@ -211,11 +224,16 @@ def through_files(scene):
                    flags=flags)
 
 
+def background_of(scene):
+    """Return the background of an image, as photutils measures it."""
+    # A saturated star may take much of a box.
+    return Background2D(scene.image, 64, mask=scene.mask,
+                        exclude_percentile=50)
+
+
 def background_free(scene):
     """Return the image without its background, and the background's noise."""
-    # A saturated star may take much of a box.
-    found = Background2D(scene.image, 64, mask=scene.mask,
-                         exclude_percentile=50)
+    found = background_of(scene)
     return scene.image - found.background, found.background_rms
 
 

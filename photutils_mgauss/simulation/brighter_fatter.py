@@ -4,17 +4,19 @@ Stars photon by photon, where charge pushes later charge away.
 GalSim's model of a silicon sensor moves the edges of pixels with the charge
 they hold, which makes bright stars wider than faint ones.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from photutils.psf import GriddedPSFModel
 
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
+from photutils_mgauss.simulation.optics import PHOTON_RADIUS
 from photutils_mgauss.utils.validation import as_real
 
 # Half the side of the stamp that a star's photons fall on, and of its middle
 # where charge moves [pix]. The time goes with the area of the middle.
-_HALF, _CORE = 24, 8
+_HALF, _CORE = PHOTON_RADIUS, 8
 
 # Of fainter stars [electron] the effect moves less than 1e-4 of the charge;
 # they are drawn as if there were none.
@@ -38,17 +40,21 @@ def shoot_stars(psf, x, y, flux, response, strength, rng):
     """
     source = _source(psf)
     sensor = _sensor(strength, rng)
+    from galsim.utilities import single_threaded
     response = np.pad(response, _HALF, constant_values=1.0)
     wide = np.zeros(response.shape, np.float32)
     stamps = [_stamp(a, b) for a, b in zip(x, y, strict=True)]
     # So many photons that a pixel of the best response loses none of them.
     best = np.array([response[stamp].max() for stamp in stamps])
     numbers = rng.poisson(flux * best)
-    for a, b, stamp, number in zip(x, y, stamps, numbers, strict=True):
-        middle = np.array([[a - round(a)], [b - round(b)]])
-        places = middle + source(a, b, number, rng)
-        places = _converted(places, response[stamp], rng)
-        wide[stamp] = _accumulate(sensor, places, wide[stamp])
+    # GalSim would share out the few pixels of each star among threads, which
+    # takes longer than the work.
+    with single_threaded():
+        for a, b, stamp, number in zip(x, y, stamps, numbers, strict=True):
+            middle = np.array([[a - round(a)], [b - round(b)]])
+            places = middle + source(a, b, number, rng)
+            places = _converted(places, response[stamp], rng)
+            wide[stamp] = _accumulate(sensor, places, wide[stamp])
     return wide[_HALF:-_HALF, _HALF:-_HALF]
 
 
@@ -87,7 +93,12 @@ class OpticsPhotons:
     """
 
     psf: GriddedPSFModel
-    oversampling: int = 4
+    totals: dict = field(default_factory=dict)
+
+    @cached_property
+    def _axes(self):
+        return [np.unique(axis) for axis in
+                np.transpose(self.psf.grid_xypos)]
 
     def __call__(self, x, y, number, rng):
         """Draw places (2, number) relative to a star at x, y [pix]."""
@@ -97,37 +108,31 @@ class OpticsPhotons:
                                zip(nodes, shares, strict=True)], axis=1)
 
     def _neighbours(self, x, y):
-        """Return the four nodes around a place and their weights."""
-        axes = [np.unique(axis) for axis in np.transpose(self.psf.grid_xypos)]
+        """Return the numbers of four nodes around a place, and weights."""
         cells = []
-        for axis, value in zip(axes, (x, y), strict=True):
+        for axis, value in zip(self._axes, (x, y), strict=True):
             low = int(np.clip(np.searchsorted(axis, value) - 1, 0,
                               axis.size - 2))
             share = np.clip((value - axis[low])
                             / (axis[low + 1] - axis[low]), 0, 1)
-            cells.append(((axis[low], 1 - share), (axis[low + 1], share)))
-        return ([(float(a), float(b)) for b, _ in cells[1]
+            cells.append(((low, 1 - share), (low + 1, share)))
+        return ([a + self._axes[0].size * b for b, _ in cells[1]
                  for a, _ in cells[0]],
                 [v * u for _, v in cells[1] for _, u in cells[0]])
 
     def _at_node(self, node, number, rng):
         """Draw places (2, number) from the light at a node."""
-        # Drawing takes long, and other exposures have the same nodes.
-        drawn = self.psf.meta.setdefault('photons', {})
-        optics = self.psf.meta['optics']
-        key = (optics.diffusion, self.oversampling, node)
-        if key not in drawn:
-            light = optics.light(*node, oversampling=self.oversampling,
-                                 radius=_HALF)
-            total = np.cumsum(np.maximum(light, 0))
-            drawn[key] = total / total[-1]
-        chosen = np.searchsorted(drawn[key], rng.random(number),
+        light = self.psf.meta['light']
+        if node not in self.totals:
+            total = np.cumsum(np.maximum(light.images[node], 0), dtype=float)
+            self.totals[node] = total / total[-1]
+        chosen = np.searchsorted(self.totals[node], rng.random(number),
                                  side='right')
-        side = 2 * _HALF * self.oversampling + 1
+        side = light.images.shape[2]
         row, column = np.divmod(chosen, side)
         place = np.stack([column, row]) - (side - 1) / 2
         place += rng.uniform(-0.5, 0.5, place.shape)
-        return place / self.oversampling
+        return place / light.oversampling
 
 
 def _source(psf):
@@ -135,7 +140,7 @@ def _source(psf):
     if isinstance(psf, GriddedMixturePSF) and psf.pixel_integrated:
         return lambda x, y, number, rng: photons(psf.mixture_at(x, y),
                                                  number, rng)
-    if isinstance(psf, GriddedPSFModel) and 'optics' in psf.meta:
+    if isinstance(psf, GriddedPSFModel) and 'light' in psf.meta:
         return OpticsPhotons(psf)
     msg = ('psf must be a GriddedMixturePSF with pixel_integrated=True, or '
            'made by Optics.to_gridded_psf, for the brighter-fatter effect, '

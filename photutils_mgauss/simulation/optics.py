@@ -31,6 +31,11 @@ __doctest_requires__ = {'Optics*': ['galsim']}
 _NOLL = np.arange(4, 12)
 _STRENGTH = np.array([1, 1, 1, 0.8, 0.8, 0.5, 0.5, 0.5])
 
+# Half the side of the stamp that photons are drawn on [pix], and the fewest
+# samples of light in a pixel.
+PHOTON_RADIUS = 24
+FINEST = 4
+
 
 @dataclass(frozen=True, eq=False)
 class Optics:
@@ -127,6 +132,19 @@ class Optics:
                          for c in self._coefficients]
         return result
 
+    @cached_property
+    def _params(self):
+        return _galsim().GSParams(maximum_fft_size=8192,
+                                  folding_threshold=2.5e-3)
+
+    @cached_property
+    def _apertures(self):
+        """The pupil as each wavelength samples it, the same everywhere."""
+        return [_galsim().Aperture(
+            self.band.diameter, lam=wavelength, oversampling=1.5,
+            pad_factor=1.5, gsparams=self._params)
+            for wavelength, _ in self.band.colours(self.n_wavelengths).T]
+
     def profile(self, x, y):
         """
         Return the star at a place, before pixels.
@@ -146,15 +164,14 @@ class Optics:
     def _profile(self, x, y, variance):
         """Return the star, widened by a Gaussian of a variance."""
         galsim = _galsim()
-        params = galsim.GSParams(maximum_fft_size=8192,
-                                 folding_threshold=2.5e-3)
+        params = self._params
         error = self.aberrations(x, y)
         colours = [weight * galsim.OpticalPSF(
-            lam=wavelength, diam=self.band.diameter,
-            aberrations=list(error / wavelength), oversampling=1.5,
-            pad_factor=1.5, gsparams=params)
-            for wavelength, weight in
-            self.band.colours(self.n_wavelengths).T]
+            lam=wavelength, diam=self.band.diameter, aper=aperture,
+            aberrations=list(error / wavelength), gsparams=params)
+            for (wavelength, weight), aperture in zip(
+                self.band.colours(self.n_wavelengths).T,
+                self._apertures, strict=True)]
         light = galsim.Sum(colours)
         blur = galsim.Gaussian(sigma=float(np.sqrt(variance)))
         return galsim.Convolve([light, blur], gsparams=params)
@@ -199,18 +216,26 @@ class Optics:
         places = chebyshev.chebpts1(min(n_samples, n_nodes))
         if n_nodes <= n_samples:
             places = nodes
+        # The light is drawn so finely that no wave is left that its samples
+        # do not show.
+        step = -(-FINEST // oversampling)
+        half = max(radius, PHOTON_RADIUS) + 1
         with waiting('Optics.to_gridded_psf'):
-            images = np.array([[self._sample(*self._place(u, v), oversampling,
-                                             radius) for u in places]
-                               for v in places])
+            light = np.array([[self.light(
+                *self._place(u, v), oversampling=step * oversampling,
+                radius=half) for u in places] for v in places])
         share = _interpolation(places, nodes)
-        images = np.einsum('jb,ia,bayx->jiyx', share, share, images,
-                           optimize=True)
-        return GriddedPSFModel(NDData(
-            images.reshape(-1, *images.shape[2:]), meta={
-                'grid_xypos': [self._place(u, v) for v in nodes
-                               for u in nodes],
-                'oversampling': oversampling, 'optics': self}))
+        light = np.einsum('jb,ia,bayx->jiyx', share, share, light,
+                          optimize=True).reshape(-1, *light.shape[2:])
+        images = np.array([_cut(
+            self._through_pixels(image, step * oversampling),
+            radius * step * oversampling)[::step, ::step] for image in light])
+        return GriddedPSFModel(NDData(images, meta={
+            'grid_xypos': [self._place(u, v) for v in nodes for u in nodes],
+            'oversampling': oversampling, 'optics': self,
+            'light': LightTable(step * oversampling, np.array([_cut(
+                image, PHOTON_RADIUS * step * oversampling)
+                for image in light], np.float32))}))
 
     def light(self, x, y, *, oversampling=4, radius=24):
         """
@@ -243,28 +268,54 @@ class Optics:
         (65, 65)
         """
         n = 2 * radius * oversampling + 1
-        side = self.pixel_scale / oversampling
         variance = self.jitter**2 + self.diffusion**2
-        narrower = max(variance - side**2 / 12, variance / 100)
-        image = self._profile(x, y, narrower).drawImage(
-            nx=n, ny=n, scale=side, method='no_pixel', dtype=float)
+        image = self._profile(
+            x, y, variance - self._sample_variance(oversampling)).drawImage(
+            nx=n, ny=n, scale=self.pixel_scale / oversampling,
+            method='no_pixel', dtype=float)
         return image.array
+
+    def _sample_variance(self, oversampling):
+        """Return by how much `light` is narrower than the star [arcsec^2]."""
+        variance = self.jitter**2 + self.diffusion**2
+        side = self.pixel_scale / oversampling
+        return min(side**2 / 12, 0.99 * variance)
+
+    def _through_pixels(self, light, oversampling):
+        """Return the effective PSF that an image of light has."""
+        n = len(light)
+        # In turns per native pixel.
+        wave = np.fft.fftfreq(n) * oversampling
+        variance = (self._sample_variance(oversampling)
+                    / self.pixel_scale**2)
+        share = np.sinc(wave) * np.exp(-2 * variance * (np.pi * wave)**2)
+        changed = np.fft.fft2(light) * share * share[:, None]
+        return np.fft.ifft2(changed).real * oversampling**2
 
     def _place(self, u, v):
         """Return x and y [pix] of coordinates that run from -1 to 1."""
         ny, nx = self.shape
         return float((u + 1) / 2 * (nx - 1)), float((v + 1) / 2 * (ny - 1))
 
-    def _sample(self, x, y, oversampling, radius):
-        """Return the effective PSF at a place, its sum oversampling^2."""
-        galsim = _galsim()
-        n = 2 * radius * oversampling + 1
-        star = galsim.Convolve([self.profile(x, y),
-                                galsim.Pixel(self.pixel_scale)])
-        image = star.drawImage(nx=n, ny=n, method='no_pixel',
-                               scale=self.pixel_scale / oversampling,
-                               dtype=float)
-        return image.array * oversampling**2
+
+@dataclass(frozen=True, eq=False)
+class LightTable:
+    """
+    The light of stars before pixels, at the nodes of a PSF.
+
+    ``images`` (M, n, n) have the shares of photons in each sample, of which
+    a pixel has ``oversampling`` along each axis.
+    """
+
+    oversampling: int
+    images: np.ndarray
+
+
+def _cut(image, half):
+    """Return the middle of an image, so many samples to each side."""
+    middle = len(image) // 2
+    return image[middle - half:middle + half + 1,
+                 middle - half:middle + half + 1]
 
 
 def _interpolation(places, nodes):

@@ -111,6 +111,8 @@ def widen(psf, stddev):
         optics = psf.meta['optics']
         meta['optics'] = replace(optics, diffusion=float(np.hypot(
             optics.diffusion, stddev * optics.pixel_scale)))
-        # What photons are drawn from serves other exposures, too.
-        meta['photons'] = psf.meta.setdefault('photons', {})
+        light = psf.meta['light']
+        meta['light'] = replace(light, images=np.array([gaussian_filter(
+            image, stddev * light.oversampling, mode='constant')
+            for image in light.images]))
     return GriddedPSFModel(NDData(np.array(images), meta=meta))

@@ -1,4 +1,6 @@
 """PSFs from optics, against GalSim's own drawing."""
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.nddata import NDData
@@ -17,7 +19,10 @@ from photutils_mgauss.simulation import (
     simulate,
     simulate_catalogues,
 )
-from photutils_mgauss.simulation.brighter_fatter import photons
+from photutils_mgauss.simulation.brighter_fatter import (
+    OpticsPhotons,
+    photons,
+)
 from photutils_mgauss.simulation.optics import _interpolation
 from photutils_mgauss.simulation.renderer import widen
 
@@ -67,6 +72,42 @@ def test_the_psf_of_a_node_is_what_galsim_draws_there():
     assert_allclose(image[rows, columns] / 1e5, expected, rtol=0,
                     atol=1e-3 * expected.max())
     assert np.ptp([image.max() for image in psf.data]) > 0.05
+
+
+@pytest.mark.parametrize('oversampling', [2, 3, 4])
+def test_a_table_is_what_galsim_draws_through_the_pixel(oversampling):
+    galsim = pytest.importorskip('galsim')
+    optics = Optics((102, 103), 'NUV', n_wavelengths=1)
+    psf = optics.to_gridded_psf(2, oversampling=oversampling, radius=8)
+    # Large and fine: GalSim folds what is beyond its image in both spaces.
+    expected = galsim.Convolve([
+        optics.profile(0, 0), galsim.Pixel(0.074)]).drawImage(
+        nx=601, ny=601, scale=0.074 / 12, method='no_pixel',
+        dtype=float).array * 144
+    step = 12 // oversampling
+    expected = expected[300 - 96:301 + 96:step, 300 - 96:301 + 96:step]
+    assert_allclose(psf.data[0], expected, rtol=0, atol=1e-6 * expected.max())
+
+
+def test_photons_are_drawn_from_the_light_of_the_table():
+    pytest.importorskip('galsim')
+    optics = Optics((102, 103), n_wavelengths=1)
+    wide = widen(optics.to_gridded_psf(2, n_samples=2, radius=8), 0.2)
+    table = wide.meta['light']
+    side = table.images.shape[1]
+    # Interpolated to the nodes like the table, and as wide as the table.
+    expected = replace(optics, diffusion=float(np.hypot(
+        0.026, 0.2 * 0.074))).light(0, 0, oversampling=table.oversampling)
+    assert expected.shape == (side, side)
+    assert_allclose(table.images[0], expected, rtol=0,
+                    atol=2e-3 * expected.max())
+    places = OpticsPhotons(wide)(0, 0, 20_000, np.random.default_rng(1))
+    drawn = np.histogram2d(*places[::-1], bins=side, range=[[
+        -24.125, 24.125]] * 2)[0]
+    steps = np.abs(np.arange(side) - side // 2)
+    core = np.add.outer(steps, steps) < 3 * table.oversampling
+    share = expected[core].sum() / expected.sum()
+    assert abs(drawn[core].sum() / 20_000 - share) < 0.015
 
 
 def test_aberrations_are_zernikes_from_defocus_on():
