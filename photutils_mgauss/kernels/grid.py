@@ -1,5 +1,6 @@
 """Mixtures on a detector grid, four neighbours blended."""
-from math import sqrt
+from math import exp, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -207,6 +208,57 @@ def _blend_sums(index, weights, sums, k, out):
         out[j] = 0.0
         for corner in range(4):
             out[j] += weights[corner] * sums[index[corner], k, j]
+
+
+class Merged(NamedTuple):
+    """A grid of one node of K Gaussians; see `merge_nodes`."""
+
+    nodes: np.ndarray
+    falls: np.ndarray
+    axis: np.ndarray
+    sums: np.ndarray
+
+    @classmethod
+    def empty(cls, k):
+        """Return memory for K Gaussians."""
+        return cls(np.empty((1, k, 6)), np.empty((1, k)), np.zeros(1),
+                   np.empty(6))
+
+
+@inner
+def merge_nodes(index, weights, nodes, merged):
+    """
+    Put one Gaussian for each four of the same number into a grid of one node.
+
+    Each has the flux, centroid and second moments of the four. Returns
+    whether there are such Gaussians: there may be none for lights of both
+    signs.
+    """
+    sums = merged.sums
+    for k in range(nodes.shape[1]):
+        sums[:] = 0.0
+        for corner in range(4):
+            a, x, y, p, s, q = nodes[index[corner], k]
+            f = weights[corner] * a / sqrt(p * q)
+            sums[0] += f
+            sums[1] += f * x
+            sums[2] += f * y
+            sums[3] += f * (x * x + s * s / q + 1 / p)
+            sums[4] += f * (x * y + s / q)
+            sums[5] += f * (y * y + 1 / q)
+        if sums[0] == 0:
+            merged.nodes[0, k] = 0.0
+            continue
+        f, x, y, sxx, sxy, syy = _central(sums)
+        s = sxy / syy
+        narrow = sxx - s * sxy
+        if not (syy > 0 and narrow > 0):
+            return False
+        row = merged.nodes[0, k]
+        row[0], row[1], row[2] = f / sqrt(narrow * syy), x, y
+        row[3], row[4], row[5] = 1 / narrow, s, 1 / syy
+        merged.falls[0, k] = exp(-row[3])
+    return True
 
 
 @inner

@@ -12,6 +12,7 @@ from photutils_mgauss.kernels.descent import (
     next_damping,
     remainder,
 )
+from photutils_mgauss.kernels.grid import Merged, blend_weights, merge_nodes
 from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import copy_matrix, copy_vector
 from photutils_mgauss.kernels.profile import (
@@ -38,6 +39,12 @@ _NOT_CONVERGED = 0
 CONVERGED = 3
 STALLED = 2
 BAD_ERROR = -1
+
+# With a PSF of fewer Gaussians a star is brought closer to its minimum where
+# it is not farther than the first of these, in two steps where it is farther
+# than the second, in pixels or fractions of the flux.
+_FAR = 0.5
+_NEAR = 3e-3
 
 
 class Stars(NamedTuple):
@@ -119,7 +126,7 @@ class FitScratch(NamedTuple):
     The memory in which groups of stars are fitted.
 
     The equations at the last point and, in boxes, those at the next one; the
-    numbers fitted, and what they are limited to.
+    numbers fitted, and what they are limited to; a simpler PSF.
     """
 
     boxes: BoxScratch
@@ -127,19 +134,22 @@ class FitScratch(NamedTuple):
     work: _Work
     limits: _Limits
     parameters: np.ndarray
+    merged: Merged
 
     @classmethod
-    def empty(cls, stars, stop):
+    def empty(cls, stars, k, stop):
         """
         Return the memory for the largest group of some stars.
 
-        Once stop (1,) is True, fits end.
+        k is how many Gaussians a node of the PSF has. Once stop (1,) is True,
+        fits end.
         """
         n = int(np.max(np.diff(stars.starts), initial=1))
         boxes = BoxScratch.empty(n, stars.boxes, stop)
         size = 3 * n + 1
         return cls(boxes, Equations.empty(*boxes.data.shape, size),
-                   _Work.empty(n), _Limits.empty(size), np.empty(size))
+                   _Work.empty(n), _Limits.empty(size), np.empty(size),
+                   Merged.empty(k))
 
 
 @inner
@@ -307,6 +317,52 @@ def _accept(parameters, old, new, n, size, work):
 
 
 @inner
+def _approach(parameters, fit_sky, pixels, psf, scratch, merged, work, old,
+              new, limits, chi2):
+    """
+    Bring a single star close to its minimum with a PSF of fewer Gaussians.
+
+    At most two steps, of an evaluation each. Where they would be long or do
+    not lower chi2, parameters stay what they were. Returns the evaluations.
+    """
+    nodes, _, x_grid, y_grid, integrated = psf
+    index, weights = scratch.tiling.index, scratch.tiling.weights
+    blend_weights(parameters[1], parameters[2], x_grid, y_grid, index,
+                  weights)
+    if not merge_nodes(index, weights[0], nodes, merged):
+        return 0
+    size = 3 + fit_sky
+    simple = (merged.nodes, merged.falls, merged.axis, merged.axis,
+              integrated)
+    best = _begin(parameters, 1, fit_sky, pixels, simple, scratch, work, old,
+                  chi2)
+    far = _aim(parameters, old, limits, size, work, scratch.stop)
+    if not far < _FAR:
+        return 1
+    if far > _NEAR:
+        normal_equations(work.trial, 1, fit_sky, pixels, simple, scratch, old,
+                         new, chi2)
+        if not chi2[0] < best:
+            return 2
+        copy_vector(work.trial, size, parameters)
+        if not _aim(parameters, new, limits, size, work,
+                    scratch.stop) < far:
+            return 2
+    copy_vector(work.trial, size, parameters)
+    return 1 + (far > _NEAR)
+
+
+@inner
+def _aim(parameters, equations, limits, size, work, stop):
+    """Put an undamped step of a single star into work; return its size."""
+    _freeze(parameters, limits, equations.gradient, size, work.frozen)
+    if not _factorize(equations, 0.0, size, work, stop):
+        return np.inf
+    _solve(parameters, equations, limits, 1, size, work)
+    return _step_size(work.step, parameters, equations.matrix, 1)
+
+
+@inner
 def _minimize(parameters, n, fit_sky, pixels, psf, scratch, work, old, new,
               limits, max_iterations, chi2):
     """
@@ -467,7 +523,7 @@ def _put_results(parameters, sky_variance, factor, first, n, fit_sky, fits):
 def _fit_group(image, stars, first, n, fixed, fit_sky, psf, max_iterations,
                scratch, fits):
     """Fit the n stars from first on; see `fit_stars`."""
-    boxes, old, work, limits, parameters = scratch
+    boxes, old, work, limits, parameters, merged = scratch
     data, weights, new, around, chi2 = boxes
     n_pixels = _load_group(image, stars, first, n, fixed, parameters, limits,
                            data, weights)
@@ -477,7 +533,11 @@ def _fit_group(image, stars, first, n, fixed, fit_sky, psf, max_iterations,
         return
     rows = slice(first, first + n)
     pixels = Pixels(stars.boxes[rows], data, weights, image.gain)
-    evaluations = _minimize(
+    evaluations = 0
+    if n == 1 and psf[0].shape[0] > 1 and max_iterations > 0:
+        evaluations = _approach(parameters, fit_sky, pixels, psf, around,
+                                merged, work, old, new, limits, chi2)
+    evaluations += _minimize(
         parameters, n, fit_sky, pixels, psf, around, work, old, new, limits,
         max_iterations, chi2)
     sky_variance = _covariances(old, limits, n, 3 * n + fit_sky, work,

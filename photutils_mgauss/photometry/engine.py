@@ -308,7 +308,7 @@ class Fits:
 
 def _fit_chunk(image, psf, fit_sky, max_iterations, stop, stars):
     fits = Fits.empty(len(stars.initial))
-    scratch = kernels.FitScratch.empty(stars, stop)
+    scratch = kernels.FitScratch.empty(stars, psf[0].shape[1], stop)
     kernels.fit_stars(image, stars.arrays, stars.fixed, bool(fit_sky), psf,
                       max_iterations, scratch, fits.arrays)
     return fits

@@ -86,3 +86,34 @@ def test_a_second_fit_stays_where_the_first_ended(psf, scene):
     # Errors are those at most a last step away.
     assert_allclose(again.covariances[good], fits.covariances[good],
                     rtol=1e-3, atol=1e-6 * error[good].max() ** 2)
+
+
+def test_the_order_of_gaussians_does_not_matter(psf, scene):
+    # The first steps merge Gaussians of one number, which may be far from
+    # each other, or of opposite signs.
+    image, error, mask, start = scene
+    pixels = engine.kernel_image(image, error, mask)
+    stars = groups(start, (11, 11), False)
+    rows, strides, *others = engine.psf_arrays(psf)
+    fits = engine.fit_stars(pixels, (rows, strides, *others), stars)
+    mixed, strides = rows.copy(), strides.copy()
+    for node in (1, 2):
+        mixed[node], strides[node] = rows[node, ::-1], strides[node, ::-1]
+    # Two Gaussians more, whose light adds up to nothing.
+    pair = np.repeat(rows[:, :1], 2, axis=1)
+    pair[:, 1, 0] *= -1
+    pair[:2, :, 0] *= -1
+    more = np.concatenate([mixed, pair], axis=1)
+    falls = np.concatenate([strides, np.repeat(strides[:, :1], 2, axis=1)],
+                           axis=1)
+    falls[:, -2:] = np.exp(-more[:, -2:, 3])
+    good = fits.outcome[:, 0] == 3
+    for other in ((mixed, strides, *others), (more, falls, *others)):
+        again = engine.fit_stars(pixels, other, stars)
+        same = good & (again.outcome[:, 0] == 3)
+        assert same.sum() > 0.99 * good.sum()
+        apart = np.abs(again.values - fits.values)[same]
+        # Blended stars may have two minima.
+        assert np.mean(apart[:, 1:].max(axis=1) < 1e-5) > 0.98
+        assert np.mean(apart[:, 0] < 1e-5 * np.abs(fits.values[same, 0])
+                       ) > 0.98
