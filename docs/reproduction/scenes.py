@@ -1,7 +1,7 @@
 """A detector: its true PSF, a sparse exposure, models of its PSF."""
 import tempfile
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 import astropy.units as u
@@ -88,12 +88,17 @@ class Detector:
         """The PSF of faint stars, the spread of charge included."""
         return self.sparse.psf
 
-    def true_image(self, x, y, *, oversampling=2, radius=20):
-        """Return the true PSF, its pixel included, around a place."""
-        steps = np.arange(-radius * oversampling,
-                          radius * oversampling + 1) / oversampling
-        return self.truth.evaluate(*np.meshgrid(x + steps, y + steps), 1, x,
-                                   y)
+    @cached_property
+    def true_image(self):
+        """What gives the true PSF at x, y, its pixel included."""
+        steps = np.arange(-40, 41) / 2
+
+        # Several models are compared with it at the same places.
+        @cache
+        def image(x, y):
+            return self.truth.evaluate(*np.meshgrid(x + steps, y + steps), 1,
+                                       x, y)
+        return image
 
     @cached_property
     def sparse(self):

@@ -1,5 +1,5 @@
 """Seven exposures of stars and quasars: what Figs. 8 to 12 show."""
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import astropy.units as u
 import numpy as np
@@ -76,6 +76,7 @@ class Catalogues:
     """What was measured of each exposure, by its number and the model."""
 
     run: object
+    solved: dict = field(default_factory=dict)
 
     def __getitem__(self, key):
         number, wanted = key
@@ -84,6 +85,13 @@ class Catalogues:
             f'epoch_{number}_{name}',
             lambda name=name: _observe(self.run, number, name),
             keep=False) for name in MODELS}[wanted]
+
+    def solution(self, name, which):
+        """Return the joint solution of some of the exposures, made once."""
+        key = name, tuple(which)
+        if key not in self.solved:
+            self.solved[key] = _solve(self.run, self, *key)
+        return self.solved[key]
 
 
 # Positions
@@ -196,7 +204,7 @@ def _positions(run, catalogues):
     """Return errors of positions by band, model, coordinate, magnitude."""
     taken, truth, rows = exposures(run), sources(run), []
     for name in MODELS:
-        solution = _solve(run, catalogues, name, range(7))
+        solution = catalogues.solution(name, range(7))
         parts = {band: [] for band in 'gri'}
         for number in range(7):
             away, stated, _, j = _corrected(
@@ -216,7 +224,7 @@ def _found(run, catalogues):
     """Return how often each source was found, and where it is."""
     truth = sources(run)
     count = np.zeros(len(truth), int)
-    solution = _solve(run, catalogues, 'paper', range(7))
+    solution = catalogues.solution('paper', range(7))
     for number in range(7):
         count[_corrected(run, solution, catalogues[number, 'paper'], number,
                          number)[3]] += 1
@@ -254,7 +262,7 @@ def _motions(run, catalogues):
     places = SkyCoord(truth['ra'], truth['dec'])
     rows = []
     for count, which in CAMPAIGNS.items():
-        joint = _solve(run, catalogues, 'paper', which)
+        joint = catalogues.solution('paper', which)
         common = joint.bootstrap(run.settings.resamplings,
                                  rng=35).motion.std(axis=0)
         rows += _motion_rows('joint', count, joint, truth, places, chosen,
