@@ -192,10 +192,32 @@ def reduced_rhs(problem):
     """
     if not problem.ties.all():
         problem = problem.select(np.flatnonzero(problem.ties))
-    columns, _, factor, y, solved = _alone(problem)
-    away = _residuals(problem.offsets, columns, apply_transposed(factor, y))
+    _, away, solved = fitted(problem)
     return -_direct_rhs(problem.weights * solved, away,
                         problem.transform.basis(problem.origin)).ravel()
+
+
+def fitted(problem):
+    """
+    Return what fits stars best in the frames as they are.
+
+    Their parameters (p, n), the residuals (2, E, n), and which of them are
+    solved (n,).
+    """
+    columns, _, factor, y, solved = _alone(problem)
+    values = apply_transposed(factor, y)
+    return values, _residuals(problem.offsets, columns, values), solved
+
+
+def leverages(problem):
+    """Return what part of its chi-square a detection fits itself, (E, n)."""
+    columns, weighted, factor, _, _ = _alone(problem)
+    inverse = gram(factor)
+    out = np.zeros(problem.weights.shape[1:])
+    for k, (x, y) in enumerate(weighted):
+        for j, (own_x, own_y) in enumerate(columns):
+            out += inverse[j, k] * (_times(own_x, x) + _times(own_y, y))
+    return out
 
 
 def _direct(weights, basis):
@@ -304,7 +326,7 @@ def _judge(residuals, predicted, weights):
     x, y = residuals
     xx, xy, yy = weights
     used = (xx > 0) & np.isfinite(x)
-    raw = xx * x * x + 2 * xy * x * y + yy * y * y
+    raw = plain_chi2(residuals, weights)
     leverage = (xx * predicted[0] + 2 * xy * predicted[1]
                 + yy * predicted[2])
     covariance = invert_2x2(xx, xy, yy)
@@ -319,6 +341,12 @@ def _judge(residuals, predicted, weights):
     return tuple(np.where(good, values, np.nan) for good, values in (
         (sound, chi2), (used, raw),
         (used, dimensions_2x2(weights) - leverage)))
+
+
+def plain_chi2(residuals, weights):
+    """Return r^T W r of residuals (2, ...) and weights (3, ...)."""
+    (x, y), (xx, xy, yy) = residuals, weights
+    return xx * x * x + 2 * xy * x * y + yy * y * y
 
 
 def _times(column, value):
@@ -361,6 +389,25 @@ def _shift(basis, correction):
     return np.swapaxes(correction @ basis, 0, 1)
 
 
+def shifted(problem, correction):
+    """Return a problem whose frames have been corrected by (E, 2, b)."""
+    basis = problem.transform.basis(problem.origin)
+    return replace(problem, offsets=problem.offsets
+                   + _shift(basis, correction))
+
+
+def frame_variances(basis, inverse):
+    """Return the covariances A S^-1 A^T of single epochs, (3, E, n)."""
+    size, n = basis.shape
+    n_epochs = len(inverse) // (2 * size)
+    blocks = inverse.reshape(n_epochs, 2, size, n_epochs, 2, size)
+    out = np.empty((3, n_epochs, n))
+    for k, (c, d) in enumerate(((0, 0), (0, 1), (1, 1))):
+        for e in range(n_epochs):
+            out[k, e] = (basis * (blocks[e, c, :, e, d] @ basis)).sum(axis=0)
+    return out
+
+
 def scaled_rows(stars, factor):
     """Return Z C for S^-1 = C C^T, shape (p, n, q)."""
     return np.stack([stars.rows(k).T @ factor
@@ -375,19 +422,15 @@ def _predicted(stars, problem, inverse, framed, middle):
     :math:`D H^{-1} D^T + (P^T Z - A) S^{-1} (P^T Z - A)^T =
     P^T (1 + Z S^{-1} Z^T) P - P^T F - F^T P + A S^{-1} A^T`.
     """
-    n_epochs, size = problem.n_epochs, len(stars.basis)
-    out = np.empty((3, *problem.offsets.shape[1:]))
-    blocks = inverse.reshape(n_epochs, 2, size, n_epochs, 2, size)
-    for e in range(n_epochs):
+    out = frame_variances(stars.basis, inverse)
+    for e in range(problem.n_epochs):
         rows = [_project(stars, e, c) for c in range(2)]
         # (1 + Z S^-1 Z^T) P - 2 F, whose product with P is made symmetric.
         halves = [row + np.einsum('jn,jkn->kn', row, middle)
                   - 2 * framed[:, c, e] for c, row in enumerate(rows)]
         for k, (c, d) in enumerate(((0, 0), (0, 1), (1, 1))):
-            known = blocks[e, c, :, e, d] @ stars.basis
-            out[k, e] = ((rows[c] * halves[d]).sum(axis=0)
-                         + (rows[d] * halves[c]).sum(axis=0)) / 2 + (
-                             stars.basis * known).sum(axis=0)
+            out[k, e] += ((rows[c] * halves[d]).sum(axis=0)
+                          + (rows[d] * halves[c]).sum(axis=0)) / 2
     return out
 
 
@@ -457,10 +500,10 @@ def total_chi2(problem, estimates):
     """Return the chi-square (n,) of detections and what was known before."""
     chi2 = np.zeros(problem.n_stars)
     # Epoch by epoch: products of all are as large as what was measured.
-    for (x, y), (xx, xy, yy) in zip(
+    for residuals, weights in zip(
             estimates.residuals.swapaxes(0, 1),
             problem.weights.swapaxes(0, 1), strict=True):
-        chi2 += xx * x * x + 2 * xy * x * y + yy * y * y
+        chi2 += plain_chi2(residuals, weights)
     priors = problem.priors
     chi2[priors.stars] += priors.chi2(estimates.values)
     return chi2

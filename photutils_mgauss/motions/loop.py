@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 from astropy.table import QTable
-from scipy.special import chdtri, ndtr
+from scipy.special import chdtri
 
 from photutils_mgauss.motions.chip_maps import (
     chip_covariance,
@@ -23,6 +23,11 @@ from photutils_mgauss.motions.joint import (
     parallax_leak,
     reduce_all,
     solve_all,
+)
+from photutils_mgauss.motions.outliers import (
+    chi2_limit,
+    judge_all,
+    worst_outliers,
 )
 from photutils_mgauss.motions.perspective import swerved
 from photutils_mgauss.motions.prepare import Setup, State
@@ -339,64 +344,47 @@ def _review(setup, state, problem, frames):
     if len(dropped):
         return replace(state, dropped=np.union1d(state.dropped,
                                                  dropped)), True
-    estimates = solve(setup, problem, frames, judge=True,
-                      only=('chi2', 'raw'))
-    each = _measured_numbers(problem)
-    bad = worst_outliers(estimates.chi2, state.used,
-                         _spare(problem, each) & ~state.crooked,
-                         setup.options.clip, each)
+    judged = judge_all(problem, frames, setup.options.clip,
+                       setup.options.executor)
+    bad = worst_outliers(judged, setup.options.clip)
+    bad[:, state.crooked[judged.stars]] = False
     if bad.any():
-        return _rejected(setup, state, bad), True
-    untied = state.untied | _inconsistent(setup, problem, estimates)
+        return _rejected(setup, state, judged.stars, bad), True
+    untied = state.untied | _inconsistent(setup, problem, judged)
     return replace(state, untied=untied), bool(
         (untied & ~state.untied).any())
 
 
-def _measured_numbers(problem):
-    """Return how many numbers each detection measures, (E, n)."""
-    out = np.zeros(problem.weights.shape[1:], dtype=np.int8)
-    for e in range(problem.n_epochs):
-        weights = problem.weights[:, e]
-        out[e] = dimensions_2x2(weights) * (weights[0] + weights[2] > 0)
-    return out
-
-
-def _rejected(setup, state, bad):
+def _rejected(setup, state, stars, bad):
     """
-    Return the state without bad detections (E, n).
+    Return the state without bad detections (E, k) of k stars.
 
     Where there are many, it is the star that does not move straight, and
     what would be left of them is no better than what was rejected.
     """
-    usable, used = setup.sightings.usable, state.used & ~bad
-    lost = (usable & ~used).sum(axis=0)
+    usable = setup.sightings.usable[:, stars]
+    left = state.used[:, stars] & ~bad
+    lost = (usable & ~left).sum(axis=0)
     crooked = bad.any(axis=0) & (lost > FEW) & (
         lost > MANY * usable.sum(axis=0))
-    return replace(state, used=np.where(crooked, usable, used),
-                   untied=state.untied | crooked,
-                   crooked=state.crooked | crooked)
+    used, untied, odd = (array.copy() for array in (
+        state.used, state.untied, state.crooked))
+    used[:, stars] = np.where(crooked, usable, left)
+    untied[stars] |= crooked
+    odd[stars] |= crooked
+    return replace(state, used=used, untied=untied, crooked=odd)
 
 
-def _inconsistent(setup, problem, estimates):
+def _inconsistent(setup, problem, judged):
     """Return stars (n,) that no more rejections can make agree."""
-    dof = _measured_numbers(problem).sum(axis=0) - problem.n_parameters
-    chi2 = np.nansum(estimates.raw, axis=0)
-    out = (dof > 0) & (chi2 > chi2_limit(setup.options.clip,
-                                         np.maximum(dof, 1)))
+    dof = np.maximum(judged.count - problem.n_parameters, 0)
+    # Stars are many, and numbers of degrees of freedom few.
+    limits = chi2_limit(setup.options.clip, np.arange(dof.max() + 1))
+    out = (dof > 0) & (judged.raw > limits[dof])
     # References agree with their catalogue, or are none any more.
     out[problem.priors.stars] &= ~setup.anchors[problem.priors.stars] | (
         setup.relative)
     return out
-
-
-def _spare(problem, each):
-    """
-    Return the stars that can lose a detection and still be judged.
-
-    ``each`` (E, n) is how many numbers a detection measures, 0 where unused.
-    """
-    known = each.sum(axis=0) + problem.ranks
-    return known - 2 >= problem.n_parameters + 2
 
 
 def _discrepant(setup, problem, frames):
@@ -486,40 +474,6 @@ def _systematics(setup, state, problem, frames, *, robust=False,
     factor, added = scales.at(setup.magnitudes)
     return replace(state, scales=scales, factor=factor, added=added,
                    floor=np.median(added, axis=1))
-
-
-def chi2_limit(clip, dof):
-    """Return the chi-square as rare as a deviation by ``clip`` sigma."""
-    return chdtri(dof, 2 * ndtr(-clip))
-
-
-def worst_outliers(chi2, used, spare, clip, dimensions):
-    """
-    Return which detections to reject now, (E, n): each star's worst.
-
-    The worst is farthest beyond the `chi2_limit` of its chi-square, which
-    has 1 or 2 ``dimensions`` (E, n).
-
-    Only one of a star's goes at a time, or a twentieth of many, because a
-    bad one spoils the residuals of the good; and only where ``spare`` (n,)
-    says the star has detections enough to tell the bad one.
-    """
-    excess = np.nan_to_num(chi2, nan=0.0)
-    excess[~used] = 0.0
-    one, two = chi2_limit(clip, np.array([1, 2]))
-    for e, numbers in enumerate(dimensions):
-        excess[e] /= np.where(numbers == 1, one, two)
-    worst = excess.argmax(axis=0)
-    out = np.zeros(used.shape, dtype=bool)
-    stars = np.arange(used.shape[1])
-    out[worst, stars] = (excess[worst, stars] > 1) & spare
-    most = len(used) // 20
-    if most > 1:
-        # Those about as bad as the worst, which has spoilt the others.
-        rank = excess.argsort(axis=0)[::-1].argsort(axis=0)
-        out |= ((rank < used.sum(axis=0) // 20) & spare
-                & (excess > np.maximum(1, excess.max(axis=0) / 4)))
-    return out
 
 
 def floor_variance(residuals, covariance, expected, floor, *,
