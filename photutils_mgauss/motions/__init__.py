@@ -9,9 +9,10 @@ epochs (`matching`, `pairing`, `orientation`), the `baseline` of time, planes
 without WCS tied to the others (`ties`), and the reference objects of a
 catalogue (`references`). `prepare` makes of it what stays the same in a fit,
 with what is known beforehand (`priors`). `loop` solves, judges and rejects
-until nothing changes: a `problem` is solved for all stars and frames at once
-by `joint` and `frames`, `outliers` are detections that do not belong to their
-stars, `perspective` allows for stars that come nearer,
+until nothing changes: `posing` makes of maps and masks a `problem`, which is
+solved for all stars and frames at once by `joint` and `frames`, `outliers` are
+detections that do not belong to their stars, `perspective` allows for stars
+that come nearer,
 `relative` fixes what nothing else does, `chip_maps` solves for the
 `distortion` of chips, `terms` depend on magnitude, colour and row,
 `error_scale` makes errors right at every magnitude, `paper_recipe` is the

@@ -37,7 +37,7 @@ from operator import add
 
 import numpy as np
 
-from photutils_mgauss.motions.problem import parts
+from photutils_mgauss.motions.problem import CHUNK, parts
 from photutils_mgauss.motions.stacked import (
     Summed,
     apply,
@@ -242,9 +242,13 @@ def _block_diagonal(blocks):
     return out.reshape(n * size, n * size)
 
 
-def each_part(function, problem, executor=None):
-    """Yield what a function returns for the parts of a problem, in order."""
-    return map_parallel(function, parts(problem), executor=executor)
+def each_part(function, problem, executor=None, *others):
+    """
+    Yield what a function returns for the parts of a problem, in order.
+
+    ``others`` are further arguments, one for each part.
+    """
+    return map_parallel(function, parts(problem), *others, executor=executor)
 
 
 def reduce_all(problem, executor=None, *, like=None):
@@ -443,7 +447,7 @@ def _project(stars, e, c):
     return out
 
 
-def solve_all(problem, correction, factor, executor=None, *, only=None,
+def solve_all(problem, correction, factor, executor=None, *,
               residuals_of=None, **wanted):
     """
     Return the `Estimates` of all stars of a problem with the frames found.
@@ -456,8 +460,6 @@ def solve_all(problem, correction, factor, executor=None, *, only=None,
     factor : (M, q) `~numpy.ndarray`
         The covariance of r is ``factor @ factor.T``.
     executor : `~concurrent.futures.Executor`, optional
-    only : sequence of str, optional
-        The fields of `Estimates` that are kept, where not all are needed.
     residuals_of : (k,) int `~numpy.ndarray`, optional
         The sorted numbers of the stars whose residuals are kept, where not
         all are needed.
@@ -466,33 +468,49 @@ def solve_all(problem, correction, factor, executor=None, *, only=None,
         residuals, what the fit took away of their covariance, and what the
         detections are judged by.
     """
-    solve = partial(solve_stars, correction=correction,
+    solve = partial(_solve_part, correction=correction,
                     inverse=factor @ factor.T, **wanted)
-    whole, own, start = None, None, 0
-    if residuals_of is not None:
-        own = np.empty((*problem.offsets.shape[:2], len(residuals_of)))
+    if residuals_of is None:
+        residuals_of = np.arange(problem.n_stars)
+    n_own = len(residuals_of)
+    starts = np.arange(0, problem.n_stars, CHUNK)
+    owns = np.split(residuals_of, np.searchsorted(residuals_of, starts[1:]))
+    whole, start, first = None, 0, 0
     # Parts go as they come, or all arrays would be there twice.
-    for part in each_part(solve, problem, executor):
-        stop = start + part.values.shape[1]
-        if own is not None:
-            some = slice(*np.searchsorted(residuals_of, [start, stop]))
-            own[..., some] = part.residuals[..., residuals_of[some] - start]
+    for part in each_part(solve, problem, executor, [
+            own - start for own, start in zip(owns, starts, strict=True)]):
         if whole is None:
-            whole = _for_all(part, problem.n_stars, only)
-            if own is not None:
-                whole.pop('residuals')
+            whole = _for_all(part, problem.n_stars, n_own)
+        stop = start + part.values.shape[1]
         for name, array in whole.items():
-            array[..., start:stop] = getattr(part, name)
+            if name == 'residuals':
+                last = first + part.residuals.shape[2]
+                array[..., first:last] = part.residuals
+                first = last
+            else:
+                array[..., start:stop] = getattr(part, name)
         start = stop
-    return Estimates(**dict.fromkeys(('values', 'covariance'))
-                     | {'residuals': own} | whole)
+    return Estimates(**whole)
 
 
-def _for_all(part, n, only):
-    """Return arrays for n stars, of the kinds that a part has."""
-    arrays = {field.name: getattr(part, field.name) for field in fields(part)
-              if only is None or field.name in only}
-    return {name: np.empty((*array.shape[:-1], n), array.dtype)
+def _solve_part(problem, own, **wanted):
+    """
+    Return the `Estimates` of a part, with the residuals of some stars.
+
+    What waits for its turn must not be as large as all that was measured.
+    """
+    found = solve_stars(problem, **wanted)
+    if found.residuals is None or len(own) == problem.n_stars:
+        return found
+    return replace(found, residuals=found.residuals[..., own])
+
+
+def _for_all(part, n, n_own):
+    """Return arrays for n stars, and for the residuals of some of them."""
+    arrays = {field.name: getattr(part, field.name) for field in fields(part)}
+    return {name: np.empty((*array.shape[:-1],
+                            n_own if name == 'residuals' else n),
+                           array.dtype)
             for name, array in arrays.items() if array is not None}
 
 

@@ -21,7 +21,6 @@ from photutils_mgauss.motions.joint import (
     Estimates,
     measured_ranks,
     parallax_leak,
-    reduce_all,
     solve_all,
 )
 from photutils_mgauss.motions.outliers import (
@@ -30,9 +29,14 @@ from photutils_mgauss.motions.outliers import (
     worst_outliers,
 )
 from photutils_mgauss.motions.perspective import swerved
+from photutils_mgauss.motions.posing import (
+    Kept,
+    measured,
+    pose,
+    reduce_again,
+)
 from photutils_mgauss.motions.prepare import Setup, State
 from photutils_mgauss.motions.priors import weak_priors
-from photutils_mgauss.motions.problem import MotionProblem
 from photutils_mgauss.motions.relative import remove_mean_fields
 from photutils_mgauss.motions.stacked import (
     dimensions_2x2,
@@ -144,77 +148,18 @@ def _reference_rms(setup, state, residuals):
         if own.any() else [np.nan, np.nan] for e, own in enumerate(used)])
 
 
-def pose(setup, state, weights=None):
-    """
-    Return the `MotionProblem` of the present maps, masks and floors.
-
-    ``weights`` are those of before, where only maps have changed.
-    """
-    sightings, transform = setup.sightings, setup.transform
-    ties = _ties(setup, state)
-    priors = setup.priors.without(state.dropped).with_others(
-        setup.places.of(state.dropped))
-    offsets = np.empty_like(sightings.places)
-    if weights is None:
-        weights = _weights(setup, state)
-    places = setup.undistorted(state)
-    for e, coefficients in enumerate(state.maps):
-        aligned = transform.apply(coefficients, places[:, e])
-        offsets[:, e] = aligned - setup.origin
-    if setup.drift is not None:
-        stars, parallactic = setup.drift
-        offsets[..., stars] -= parallactic
-    if len(setup.nearing.stars):
-        offsets[..., setup.nearing.stars] -= state.swerve
-    np.nan_to_num(offsets, copy=False)
-    return MotionProblem(
-        offsets, weights, setup.origin, setup.dt,
-        sightings.observer if setup.options.parallax else None,
-        sightings.plane, transform, priors, setup.options.acceleration,
-        ties)
-
-
-def _weights(setup, state):
-    """Return the inverse covariances of the detections, 0 where unused."""
-    out = np.empty_like(setup.sightings.covariance)
-    for e, used in enumerate(state.used):
-        out[:, e] = np.where(used, invert_2x2(*measured(setup, state, e)),
-                             0.0)
-    return out
-
-
-def measured(setup, state, e):
-    """Return the covariances (3, n) of an epoch with its floor."""
-    floor = np.broadcast_to(state.floor.T, (2, len(state.maps)))[:, e]
-    xx, xy, yy = setup.sightings.covariance[:, e]
-    if state.scales is not None:
-        xx, xy, yy = state.factor[e] * setup.sightings.covariance[:, e]
-        floor = state.added[[e, e]]
-    return np.stack([xx + floor[0], xy, yy + floor[1]])
-
-
-def _ties(setup, state):
-    """Return which stars take part in finding the frames."""
-    if setup.options.recipe == 'joint' or setup.relative:
-        return ~state.untied
-    ties = setup.anchors & ~state.untied
-    ties[state.dropped] = False
-    return ties
-
-
-def _step(setup, state, weights=None, like=None):
+def _step(setup, state, kept):
     """
     Solve for the frames once; return problem, frames and new maps.
 
-    And the equations of the frames, which with the ``weights`` serve the
-    next step, ``like`` these: only offsets change with the maps.
+    And the equations of the frames, which with the weights serve the next
+    step as `Kept`: only offsets change with the maps.
     """
-    problem, back, reduced = pose(setup, state, weights), None, None
+    problem, back, reduced = pose(setup, state, kept), None, None
     if setup.transform.n_parameters == 0:
         frames = fixed_frames(problem)
     else:
-        reduced = found = reduce_all(problem, setup.options.executor,
-                                     like=like)
+        reduced = found = reduce_again(problem, kept, setup.options.executor)
         if setup.distortion is not None:
             found, back = without_chips(reduced, reduce_chips(
                 problem, setup.distortion, state.distortion))
@@ -231,15 +176,17 @@ def _step(setup, state, weights=None, like=None):
     return problem, frames, replace(state, maps=maps, swerve=swerve), reduced
 
 
-def _align(setup, state):
-    """Iterate until the maps stand still."""
+def _align(setup, state, kept=None):
+    """
+    Iterate until the maps stand still; return problem, frames, and state.
+
+    And what is `Kept` for the next state.
+    """
     before, typical = np.inf, np.sqrt(setup.sightings.typical_variance)
-    weights = reduced = None
     for i in range(MAX_ITERATIONS):
         problem = frames = None  # as large as all that was measured
-        problem, frames, after, reduced = _step(setup, state, weights,
-                                                reduced)
-        weights = problem.weights
+        problem, frames, after, reduced = _step(setup, state, kept)
+        kept = Kept(problem.weights, reduced)
         # In units of a typical error.
         size = np.abs(frames.correction).sum(axis=2).max(initial=0) / typical
         turned = np.abs(after.swerve - state.swerve).max(initial=0) / typical
@@ -252,20 +199,21 @@ def _align(setup, state):
                    'the identifiers those of the same stars?')
             raise ValueError(msg)
         before = size
-    return problem, frames, state
+    return problem, frames, state, kept
 
 
 def fit(setup, state):
     """Return the `Fit` of a setup: align, reject, estimate the floors."""
     if setup.terms is not None:
         setup, state = _with_terms(setup, state)
-    problem, frames, state = _cleaned(setup, state)
+    problem, frames, state, kept = _cleaned(setup, state)
     rounds = 12 if setup.options.scales_errors else 4
     for i in range(rounds * setup.options.fits_floor):
         after = _systematics(setup, state, problem, frames, anew=i == 0)
         still = not _moved(setup, state, after, 0.02)
+        kept = kept and kept.without_changes(problem, state, after)
         problem = frames = None
-        problem, frames, state = _align(setup, after)
+        problem, frames, state, kept = _align(setup, after, kept)
         if still:
             break
     estimates = last_estimates(setup, state, problem, frames)
@@ -279,7 +227,7 @@ def fit(setup, state):
 
 def _with_terms(setup, state):
     """Return setup and state with the terms that are real, to begin with."""
-    problem, _, after = _cleaned(setup, state)
+    problem, _, after, _ = _cleaned(setup, state)
     kinds = chosen_terms(problem, setup.terms, setup.options.executor)
     if not kinds:
         return replace(setup, terms=None), state
@@ -289,18 +237,21 @@ def _with_terms(setup, state):
 
 
 def _cleaned(setup, state):
-    """Return problem, frames and state with all outliers rejected."""
+    """Return what `_align` does, with all outliers rejected."""
+    kept = None
     for _ in range(MAX_ITERATIONS):
         problem = frames = None
-        problem, frames, state = _align(setup, state)
+        problem, frames, state, kept = _align(setup, state, kept)
         if setup.options.clip is None:
             break
+        before = state
         state, changed = _review(setup, state, problem, frames)
         if not changed:
             break
+        kept = kept.without_changes(problem, before, state)
     else:
-        state = replace(state, unfinished=True)
-    return problem, frames, state
+        kept, state = None, replace(state, unfinished=True)
+    return problem, frames, state, kept
 
 
 def fitted_terms(result):

@@ -20,7 +20,8 @@ from functools import partial
 import numpy as np
 
 from photutils_mgauss.motions.frames import MOTIONS, POSITIONS, Frames
-from photutils_mgauss.motions.loop import finished, last_estimates, pose
+from photutils_mgauss.motions.loop import finished, last_estimates
+from photutils_mgauss.motions.posing import pose
 from photutils_mgauss.motions.priors import Priors
 
 

@@ -6,6 +6,7 @@ the few rows and columns, so every operation is one long vector operation;
 the library routines for (n, p, p) stacks are several times slower here.
 """
 from dataclasses import fields
+from operator import add, sub
 
 import numpy as np
 
@@ -129,9 +130,15 @@ def variance_2x2(covariance):
 
 
 class Summed:
-    """A dataclass of arrays, of which two are added field by field."""
+    """A dataclass of arrays; two are added or subtracted field by field."""
 
     def __add__(self, other):
-        return type(self)(*(getattr(self, field.name)
-                            + getattr(other, field.name)
+        return self._combined(add, other)
+
+    def __sub__(self, other):
+        return self._combined(sub, other)
+
+    def _combined(self, how, other):
+        return type(self)(*(how(getattr(self, field.name),
+                                getattr(other, field.name))
                             for field in fields(self)))

@@ -6,8 +6,9 @@ from scipy.special import chdtri
 
 from photutils_mgauss.motions.baseline import period
 from photutils_mgauss.motions.joint import solve_all
-from photutils_mgauss.motions.loop import measured, references_in_use
+from photutils_mgauss.motions.loop import references_in_use
 from photutils_mgauss.motions.membership import fit_groups
+from photutils_mgauss.motions.posing import measured
 from photutils_mgauss.motions.propagation import FROM_OURS
 from photutils_mgauss.motions.stacked import invert_2x2
 from photutils_mgauss.sky.tangent_plane import directions

@@ -10,9 +10,9 @@ from photutils_mgauss import ProperMotionFitter
 from photutils_mgauss.motions.assemble import assemble
 from photutils_mgauss.motions.frames import solve_frames
 from photutils_mgauss.motions.joint import leverages, reduce_all, solve_all
-from photutils_mgauss.motions.loop import pose
 from photutils_mgauss.motions.matching import HowToMatch
 from photutils_mgauss.motions.outliers import chi2_limit, judge_all
+from photutils_mgauss.motions.posing import pose
 from photutils_mgauss.motions.prepare import prepare
 
 
