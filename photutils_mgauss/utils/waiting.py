@@ -9,6 +9,7 @@ is shown where the caller shows how far it is, in threads and other processes.
 import sys
 from contextlib import contextmanager
 from functools import wraps
+from importlib import import_module
 from multiprocessing import parent_process
 from shutil import get_terminal_size
 from threading import Event, Lock, Thread, current_thread, main_thread
@@ -84,7 +85,7 @@ def progress(iterable=None, *, shown=True, **options):
     with _SCREEN:
         for line in _SHOWN:
             line.take_away()
-        return tqdm(iterable, ncols=_width(), **options)
+        return tqdm(iterable, **_size(), **options)
 
 
 def has_screen():
@@ -105,10 +106,12 @@ def _somebody_looks():
             and parent_process() is None)
 
 
-def _width():
-    """Return the width of a terminal that does not know it, else None."""
-    # Only those get the fallback.
-    return 80 if get_terminal_size((0, 0)).columns == 0 else None
+def _size():
+    """Return width and height of a terminal that does not know them."""
+    # Only those get the fallback; bars are hidden where there are no rows.
+    if get_terminal_size((0, 0)).columns == 0:
+        return {'ncols': 80, 'nrows': 24}
+    return {}
 
 
 class _Line:
@@ -140,7 +143,12 @@ class _Line:
             self._bar = None
 
     def _draw(self):
-        if self._end.wait(_PATIENCE):
+        if self._end.wait(_PATIENCE / 2):
+            return
+        # Loading this takes a while on a busy machine: not when it is needed.
+        import_module('tqdm')
+        left = self._start + _PATIENCE - time()
+        if left > 0 and self._end.wait(left):
             return
         _SHOWN.append(self)
         try:
@@ -164,7 +172,7 @@ class _Line:
                 bar.refresh()
             return
         if self._bar is None:
-            self._bar = tqdm(bar_format=' ', leave=False, ncols=_width())
+            self._bar = tqdm(bar_format=' ', leave=False, **_size())
             self._bar.start_t = self._start
         self._bar.bar_format = f'{self._words} [{{elapsed}}{self._parts}]'
         self._bar.refresh()

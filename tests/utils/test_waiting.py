@@ -1,6 +1,7 @@
 """Who waits at a terminal is told, and nobody else."""
 import os
 import re
+import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -178,3 +179,29 @@ def test_simulations_that_take_long_show_their_name(monkeypatch, call):
     call()
     assert re.search(r'(sky_field|crowded_field|paper_scene) \[00:',
                      screen.getvalue())
+
+
+NO_SIZE = """
+import time
+from photutils_mgauss.utils import waiting
+waiting._PATIENCE = 0.02
+with waiting.waiting('measure'):
+    time.sleep(20)
+"""
+
+
+@pytest.mark.skipif(sys.platform == 'win32', reason='has no such terminals')
+def test_the_line_is_shown_on_a_terminal_that_does_not_know_its_size():
+    ours, theirs = os.openpty()
+    environment = {name: value for name, value in os.environ.items()
+                   if name not in ('COLUMNS', 'LINES')}
+    with subprocess.Popen(
+            [sys.executable, '-c', NO_SIZE],
+            stdin=theirs, stdout=theirs, stderr=theirs,
+            env=environment) as process:
+        os.close(theirs)
+        seen = b''
+        while b'measure [' not in seen:
+            seen += os.read(ours, 1000)
+        process.kill()
+    os.close(ours)
