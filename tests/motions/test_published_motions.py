@@ -41,7 +41,8 @@ def keck(folder):
         table = Table(dict(zip(names, map(list, zip(*rows, strict=True)),
                                strict=True)))
         positions = {new: table[old].astype(float) for old, new in (
-            ('x', 'x'), ('y', 'y'), ('xe', 'x_err'), ('ye', 'y_err'))}
+            ('x', 'x'), ('y', 'y'), ('xe', 'x_err'), ('ye', 'y_err'),
+            ('m', 'mag'))}
         epochs.append(Epoch(Table({'id': table['name'], **positions}),
                             time=float(table['t'][0])))
     names = ['id', 'kp', 'x', 'y', 'xerr', 'yerr', 'pmra', 'pmdec',
@@ -91,6 +92,34 @@ def test_keck_motions_agree_with_the_published_ones(realdata, transform,
     assert (spread <= [0.19, 0.30]).all()
     sizes = np.linalg.svd(fit.alignment['matrix'])[1]
     assert ((sizes > 9.92) & (sizes < 9.94)).all()
+
+
+def pulls_between(one, two):
+    """Return pulls (2, n) between the motions in two tables, and names."""
+    names = sorted(set(one['id']) & set(two['id']))
+    one, two = (stars[[list(stars['id']).index(name) for name in names]]
+                for stars in (one, two))
+    return np.stack([((one[name] - two[name]) / np.hypot(
+        one[f'{name}_error'], two[f'{name}_error'])).value
+        for name in ('pmra', 'pmdec')]), names
+
+
+def test_halves_of_the_keck_epochs_agree_within_their_errors(realdata):
+    # Every other epoch is in the same half, so that no error of one is in
+    # both: errors are judged without those that others state.
+    epochs, label = keck(realdata('keck_ob150029'))
+    epochs.sort(key=lambda epoch: epoch.years)
+    fitter = ProperMotionFitter(references=label_catalogue(label),
+                                systematic='magnitude')
+    pulls, names = pulls_between(*(fitter.fit(half).measured()
+                                   for half in (epochs[::2], epochs[1::2])))
+    kp = dict(zip(label['id'], label['kp'], strict=True))
+    magnitude = np.array([kp.get(name, np.nan) for name in names])
+    for bright, faint in ((17, 18), (18, 19), (19, 21)):
+        some = pulls[:, (magnitude >= bright) & (magnitude < faint)]
+        some = some[np.isfinite(some)]
+        assert len(some) > 30
+        assert 0.9 <= np.sqrt(np.mean(some**2)) <= 1.1
 
 
 def test_two_keck_epochs_give_motions(realdata):
