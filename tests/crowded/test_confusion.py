@@ -10,7 +10,11 @@ from photutils_mgauss import (
     GaussianMixture,
     GriddedMixturePSF,
 )
-from photutils_mgauss.crowded.confusion import Hidden, _Beside
+from photutils_mgauss.crowded.confusion import (
+    Hidden,
+    _Beside,
+    power_of_counts,
+)
 from photutils_mgauss.crowded.injection import match
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.psf.renderer import MixtureRenderer
@@ -95,6 +99,36 @@ def test_the_law_is_that_of_drawn_stars(flux, number):
     assert squares[:, 0] == pytest.approx(0, abs=2e-3)
     assert np.sqrt(1 + squares[:, 1]) == pytest.approx(wide, rel=0.04)
     assert medians == pytest.approx([0, median], abs=0.06)
+
+
+def counts(slope, end, n=5000):
+    """Draw fluxes above limits, and below an end times the least limit."""
+    rng = np.random.default_rng(2)
+    limit = rng.uniform(200, 400, n)
+    part = rng.uniform((end * 200 / limit)**(1 - slope), 1)
+    return limit * part**(1 / (1 - slope)), limit
+
+
+@pytest.mark.parametrize('slope', [1.3, 1.5, 2.2])
+@pytest.mark.parametrize('end', [15, 1e3, 1e9])
+def test_counts_have_their_power_wherever_they_end(slope, end):
+    assert power_of_counts(*counts(slope, end)) == pytest.approx(slope,
+                                                                 abs=0.06)
+
+
+def test_the_power_of_curved_counts_is_that_near_the_limit():
+    flux, limit = counts(1.5, 1e9)
+    # Further up counts fall much faster.
+    bend = 30 * limit
+    flux = np.where(flux > bend, bend * (flux / bend)**0.2, flux)
+    assert power_of_counts(flux, limit) == pytest.approx(1.5, abs=0.06)
+
+
+@pytest.mark.parametrize('n', [0, 1, 2])
+def test_where_few_stars_tell_counts_have_the_usual_power(n):
+    flux = np.array([250.0, 2e3])[:n]
+    assert power_of_counts(flux, np.full(n, 200.0)) == pytest.approx(
+        1.5, abs=0.1)
 
 
 @pytest.fixture(scope='module')
