@@ -362,8 +362,10 @@ class _PrepareCode(AnalysisPass):
             module.data_layout = codegen._data_layout
 
         def optimize():
-            passes, builder = codegen._module_pass_manager()
-            passes.run(library._final_module, builder)
+            # numba 0.61 gives the passes alone.
+            passes = codegen._module_pass_manager()
+            passes, *rest = passes if isinstance(passes, tuple) else [passes]
+            passes.run(library._final_module, *rest)
 
         def link_all(other):
             # Callers first: what nobody calls yet is not linked.

@@ -37,6 +37,7 @@ from photutils_mgauss.motions.tables import (
 from photutils_mgauss.sky.observers import julian_years, tdb
 from photutils_mgauss.utils.notebook import with_table
 from photutils_mgauss.utils.validation import as_integer
+from photutils_mgauss.utils.waiting import waiting
 
 
 def decode_motion_flags(flags):
@@ -206,6 +207,7 @@ class MotionSolution:
                         pm_dec=self.stars['pmdec'], frame='icrs',
                         obstime=tdb(self.stars['ref_epoch'][0].value))
 
+    @waiting('MotionSolution.at')
     def at(self, time):
         """
         Return the stars at another epoch, with their covariances then.
@@ -250,6 +252,7 @@ class MotionSolution:
         stars = _numbers_of(np.atleast_1d(ids), self.stars['id'])
         return star_covariance(self._fit, stars, self._year)
 
+    @waiting('MotionSolution.mean')
     def mean(self, ids=None):
         """
         Return the mean motion of some stars, such as members of a cluster.
@@ -285,6 +288,7 @@ class MotionSolution:
         return mean_table(len(stars), self.stars['pmra'].unit, *mean_motion(
             self._fit, stars, propagated(self._fit, self._year)))
 
+    @waiting('MotionSolution.membership')
     def membership(self, *, n_field=1):
         """
         Return the probability of each star to move with a cluster.
@@ -313,6 +317,7 @@ class MotionSolution:
         n_field = as_integer(n_field, 'n_field', minimum=1)
         return membership_table(self.stars, n_field)
 
+    @waiting('MotionSolution.accelerations')
     def accelerations(self):
         """
         Test whether stars move on straight lines.
@@ -411,6 +416,7 @@ class MotionSolution:
         """
         return detector_residuals(self.residuals, self.epochs)
 
+    @waiting('MotionSolution.bootstrap')
     def bootstrap(self, n_resamples=10000, *, rng=None):
         """
         Resample the reference objects to find the error of the frames.
@@ -475,6 +481,7 @@ class MotionSolution:
     def _year(self):
         return float(self.stars['ref_epoch'][0].value)
 
+    @waiting('MotionSolution.measured')
     def measured(self):
         """
         Return the stars as measured by the detections alone.

@@ -6,8 +6,12 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from io import StringIO
+from typing import ClassVar
 
+import astropy.units as u
+import numpy as np
 import pytest
+from astropy.table import QTable
 
 import photutils_mgauss as mg
 from photutils_mgauss.utils import waiting as module
@@ -168,17 +172,53 @@ def test_methods_of_other_packages_show_their_name(monkeypatch):
     assert 'Photometry.draw [' in screen.getvalue()
 
 
-@pytest.mark.parametrize('call', [
-    lambda: mg.sky_field(500, 0, size=1.0, separation=0.5),
-    lambda: mg.crowded_field((2000, 2000)),
-    lambda: mg.paper_scene('bulge', (60, 60))],
-    ids=['sky_field', 'crowded_field', 'paper_scene'])
-def test_simulations_that_take_long_show_their_name(monkeypatch, call):
-    screen = terminal(monkeypatch)
-    monkeypatch.setattr(module, '_PATIENCE', 0.0)
+class Named:
+    """A line that only takes down its words."""
+
+    seen: ClassVar = []
+
+    def __init__(self, words):
+        self.seen.append(words)
+
+    def count(self, done, total):
+        """No matter."""
+
+    def close(self):
+        """No matter."""
+
+
+def named(monkeypatch, call):
+    """Return what a call would show at a terminal while it lasts."""
+    terminal(monkeypatch)
+    monkeypatch.setattr(module, '_Line', Named)
+    monkeypatch.setattr(Named, 'seen', [])
     call()
-    assert re.search(r'(sky_field|crowded_field|paper_scene) \[00:',
-                     screen.getvalue())
+    return Named.seen
+
+
+@pytest.mark.parametrize('call', [
+    lambda: mg.sky_field(5, 0, size=1.0),
+    lambda: mg.crowded_field((20, 20)),
+    lambda: mg.paper_scene('bulge', (40, 40))],
+    ids=['sky_field', 'crowded_field', 'paper_scene'])
+def test_simulations_show_their_name(monkeypatch, request, call):
+    assert named(monkeypatch, call) == [request.node.callspec.id]
+
+
+def test_what_is_asked_of_motions_shows_its_name(monkeypatch):
+    rng, n = np.random.default_rng(1), 30
+    x, y, *motions = rng.uniform(0, 1000, (4, n))
+    solution = mg.ProperMotionFitter(references=list(range(10))).fit([
+        mg.Epoch(QTable({
+            'id': np.arange(n), 'y_fit': y, 'y_err': np.full(n, 0.01),
+            'x_fit': x + (np.arange(n) >= 10) * motions[0] * years / 1e4,
+            'x_err': np.full(n, 0.01)}), time=2015.0 + years,
+            pixel_scale=0.1 * u.arcsec) for years in (0, 2, 5)])
+    for ask in ('accelerations', 'measured', 'mean', 'bootstrap'):
+        names = named(monkeypatch, getattr(solution, ask))
+        assert names == [f'MotionSolution.{ask}']
+    at = named(monkeypatch, lambda: solution.at(2030.0))
+    assert at == ['MotionSolution.at']
 
 
 NO_SIZE = """
