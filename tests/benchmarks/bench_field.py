@@ -7,7 +7,7 @@ Positions with a PSF field from 150 stars, against the Cramer-Rao bound.
     python tests/benchmarks/bench_field.py --harness DIR --variants
         SCENE [SCENE ...]
     python tests/benchmarks/bench_field.py --harness DIR --undersampled
-        TABLE [TABLE ...] [--seed 5]
+        TABLE [TABLE ...] [--seed 5] [--stars 150]
     python tests/benchmarks/bench_field.py --decam DIR
 
 A scene is a folder with sci.fits, mask.fits, vartrue.fits, truth.ecsv and
@@ -28,7 +28,7 @@ cosmic rays, and for 150 stars of each other scene (steep, aberrated, ...).
 
 --undersampled takes tables of true PSFs on coarse pixels (of the class TruePSF
 of the harness) and prints a line for each: stars of 18 to 20 mag are fitted
-with the field of 150 other stars and with the true PSF, and stars without
+with the field of other stars and with the true PSF, and stars without
 noise at 64 places in a pixel say how fluxes and positions change with that.
 
 --decam needs the folder with 117 stars of a DECam chip (decam_psfex) and
@@ -489,7 +489,8 @@ def main():
     sys.path.insert(0, str(options.harness))
     for name in options.undersampled:
         from csst_psf import TruePSF
-        print_camera(name, TruePSF(name), fit_with_truth, options.seed)
+        print_camera(name, TruePSF(name), fit_with_truth, options.seed,
+                     options.stars)
     if not options.scenes:
         return
     if options.variants:

@@ -10,7 +10,9 @@ PSF, all others of 17 to 19 mag. *Pulls* are differences from the truth over
 errors, about the centre of the true PSF's core at each place, fluxes about
 their median ratio. *Differences* are those of the same stars in two exposures
 over both errors, each exposure with the PSF of stars of its own; with a
-kernel, both images are resampled with it. The light beyond the stamps of
+kernel, both images are resampled with it. What the PSF of an exposure is off
+by in the mean moves all its stars by the same, as its pointing does: x and y
+are given about the mean difference, too. The light beyond the stamps of
 either exposure makes all fluxes differ by one ratio: they are given about
 that, too, and what the ratio is off by over the errors ``wing_error`` of both.
 In brackets the same without the part of the PSF. The optics are those of
@@ -151,19 +153,23 @@ def differences(optics, n_psf, size, kernel, seed):
     (field, one), (second, other) = (
         measured(clean, error, part, test, seed + noise, kernel)
         for part, noise in ((stars[:n_psf], 1000), (stars[n_psf:], 2000)))
-    found = squares([one, other], [one[f'{name}_fit'] - other[f'{name}_fit']
-                                   for name in NAMES])
+    off = [np.asarray(one[f'{name}_fit'] - other[f'{name}_fit'])
+           for name in NAMES]
+    found = squares([one, other], off)
+    places = squares([one, other], [off[0] - off[0].mean(),
+                                    off[1] - off[1].mean(), 0])[:2]
     ratio = np.median(one['flux_fit'] / other['flux_fit'])
     for name in ('flux_fit', 'flux_err', 'flux_psf_err'):
         other[name] *= ratio
     about = squares([one, other], [0, 0, one['flux_fit'] - other['flux_fit']])
-    off = (ratio - 1) / np.hypot(field.wing_error, second.wing_error)
-    return [*found, about[2], [off**2, np.nan]]
+    pull = (ratio - 1) / np.hypot(field.wing_error, second.wing_error)
+    return [*found, *places, about[2], [pull**2, np.nan]]
 
 
 def report(label, one_scene, seeds):
     found = np.sqrt(np.mean([one_scene(seed) for seed in seeds], axis=0))
-    names = (*NAMES, 'flux about the ratio', 'ratio')[:len(found)]
+    names = (*NAMES, 'x about the mean', 'y about the mean',
+             'flux about the ratio', 'ratio')[:len(found)]
     print(f'{label:32s}' + '   '.join(
         f'{name} {full:.2f} ({without:.2f})' for name, (full, without)
         in zip(names, found, strict=True)), flush=True)

@@ -8,7 +8,7 @@ from astropy.table import QTable
 from photutils_mgauss import MixturePSFPhotometry, fit_mixture_field
 
 SIZE, SKY, READ_NOISE = 2048, 60.0, 5.0
-N_PSF, N_TEST = 150, 600
+N_TEST = 600
 ZERO_POINT = 25.8 + 2.5 * np.log10(150)
 RADIUS = 8
 PHASES = 8
@@ -18,24 +18,24 @@ def scatter(values):
     return 1.4826 * np.median(np.abs(values))
 
 
-def scene(truth_psf, seed):
+def scene(truth_psf, seed, n_psf):
     """Return data, error, stars of the PSF and stars to measure."""
     rng = np.random.default_rng(seed)
-    cells = int(np.ceil(np.sqrt(N_PSF + N_TEST)))
+    cells = int(np.ceil(np.sqrt(n_psf + N_TEST)))
     step = SIZE / cells
-    place = rng.permutation(cells**2)[:N_PSF + N_TEST]
+    place = rng.permutation(cells**2)[:n_psf + N_TEST]
     x, y = (np.array([place % cells, place // cells]) + 0.5) * step
     # Stamps of neighbours do not touch.
     x, y = np.array([x, y]) + rng.uniform(14 - step / 2, step / 2 - 14,
                                           (2, x.size))
-    faintest = np.where(np.arange(x.size) < N_PSF, 20.5, 20.0)
+    faintest = np.where(np.arange(x.size) < n_psf, 20.5, 20.0)
     flux = 10 ** (0.4 * (ZERO_POINT - rng.uniform(18, faintest)))
     clean = np.zeros((SIZE, SIZE))
     truth_psf.render(clean, x, y, flux, 18)
     variance = np.maximum(clean, 0) + SKY + READ_NOISE**2
     stars = QTable({'x': x, 'y': y, 'flux': flux})
     return (rng.normal(clean, np.sqrt(variance)), np.sqrt(variance),
-            stars[:N_PSF], stars[N_PSF:])
+            stars[:n_psf], stars[n_psf:])
 
 
 def measured(psf, data, error, stars):
@@ -82,9 +82,9 @@ def phase_errors(field, truth_psf):
     return flux, np.sqrt(np.mean(np.square(sides)))
 
 
-def print_camera(name, truth_psf, fit_with_truth, seed):
+def print_camera(name, truth_psf, fit_with_truth, seed, n_psf):
     """Print a line on a camera whose true PSF is known."""
-    data, error, stars, test = scene(truth_psf, seed)
+    data, error, stars, test = scene(truth_psf, seed, n_psf)
     start = time.process_time()
     field = fit_mixture_field(data, stars['x', 'y'], error=error,
                               radius=RADIUS)
@@ -99,8 +99,9 @@ def print_camera(name, truth_psf, fit_with_truth, seed):
     flux = np.asarray(table['flux_fit'] / test['flux'])
     pull = (flux - np.median(flux)) * test['flux'] / table['flux_err']
     phase_flux, phase_place = phase_errors(field, truth_psf)
-    print(f'{Path(name).stem:16s} integrated {field.pixel_integrated!s:5s} '
-          f'positions {scatter(mine) / scatter(ideal):.2f} times the true '
+    print(f'{Path(name).stem:16s} {n_psf} stars, integrated '
+          f'{field.pixel_integrated!s:5s} positions '
+          f'{scatter(mine) / scatter(ideal):.2f} times the true '
           f"PSF's; pulls of x, y {scatter(mine / errors):.2f}, of flux "
           f'{scatter(pull):.2f}; with phase: flux {phase_flux:.3%}, x, y '
           f'{1e3 * phase_place:.2f} mpix; {seconds:.0f} s CPU', flush=True)
