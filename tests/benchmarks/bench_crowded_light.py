@@ -16,7 +16,8 @@ simulated with a PSF of this package, which is given to the solver. Parts:
     mag at three densities;
 ``galaxy``
     a galaxy of 15 mag with a half-light radius of 60 pixels, n = 1 and 4,
-    behind a few stars: false stars beyond 40 pixels, stars found within.
+    behind a few stars: false stars beyond 40 pixels, stars found within; and
+    the same stars without it, which tell what is due to the galaxy.
 
 Stars with the flag of what is no star, or of saturation, count as not found.
 """
@@ -201,16 +202,15 @@ def print_cluster(name, scene, centre, table, seconds):
 
 
 def galaxy_part(args, optics):
+    truth = light.even_stars(args.size, args.seeds[0], 0.02)
+    stars = optics.draw(truth, (args.size, args.size))
     rows = []
-    for index in (1.0, 4.0):
-        truth = light.even_stars(args.size, args.seeds[0], 0.02)
-        shape = args.size, args.size
-        scene = light.expose(
-            optics.draw(truth, shape) + light.sersic(
-                args.size, index=index), truth, args.seeds[0]).bounded(
-                    optics.psf)
-        rows.append(print_galaxy(f'galaxy of n = {index:.0f}', scene,
-                                 *reduce(optics.psf, scene)))
+    for name, galaxy in (('no galaxy', 0), *(
+            (f'galaxy of n = {index:.0f}', light.sersic(
+                args.size, index=index)) for index in (1.0, 4.0))):
+        scene = light.expose(stars + galaxy, truth, args.seeds[0]).bounded(
+            optics.psf)
+        rows.append(print_galaxy(name, scene, *reduce(optics.psf, scene)))
     return rows
 
 

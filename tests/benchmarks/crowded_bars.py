@@ -91,8 +91,10 @@ def cluster(bars, args, optics):
 
 
 def galaxy(bars, args, optics):
-    for index, rows in zip((1, 4), scenes.galaxy_part(args, optics),
-                           strict=True):
+    alone, *both = scenes.galaxy_part(args, optics)
+    bars.add('the same stars without a galaxy: false there', 0.05,
+             alone[1:, 2], '.1%')
+    for index, rows in zip((1, 4), both, strict=True):
         bars.add(f'galaxy, n = {index}: false beyond 40 pixels', 0.05,
                  rows[1:, 2], '.1%')
         bars.add(f'galaxy, n = {index}: stars found within', 0.5, rows[0, 1],
