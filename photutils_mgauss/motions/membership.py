@@ -10,12 +10,15 @@ The parameters of highest likelihood are found by expectation maximisation
 with the errors of each star taken out (Bovy, Hogg & Roweis 2011). The
 probability that a star belongs to the cluster is the first term over the sum.
 """
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
+from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss.motions.joint import eliminate, scaled_rows
 from photutils_mgauss.motions.problem import CHUNK
+from photutils_mgauss.motions.stacked import invert_2x2
 from photutils_mgauss.sky.space_motion import turns
 
 MOST_STEPS = 2000
@@ -38,14 +41,24 @@ class Groups:
 
     def densities(self, motion, covariance):
         """Return the logarithms (J, n) of each term of the sum."""
-        whole = self.covariance[:, None] + covariance
-        away = motion - self.mean[:, None]
-        chi2 = np.einsum('jni,jni->jn', away, np.linalg.solve(
-            whole, away[..., None])[..., 0])
-        size = np.linalg.slogdet(whole)[1]
+        (x, y), (xx, xy, yy) = self.seen(motion, covariance)
+        chi2 = x * x * xx + 2 * x * y * xy + y * y * yy
         with np.errstate(divide='ignore'):
             return (np.log(self.fraction)[:, None] - np.log(2 * np.pi)
-                    - (chi2 + size) / 2)
+                    - (chi2 - np.log(xx * yy - xy * xy)) / 2)
+
+    def seen(self, motion, covariance):
+        """
+        Return motions from the means, and the weights of these.
+
+        That is w - m, (2, J, n), and the elements xx, xy, yy of the inverse
+        of V + S, (3, J, n).
+        """
+        whole = self.covariance[:, None] + covariance
+        away = motion - self.mean[:, None]
+        # numpy's functions take a hundred times as long for each matrix.
+        return np.moveaxis(away, -1, 0), invert_2x2(
+            whole[..., 0, 0], whole[..., 0, 1], whole[..., 1, 1])
 
 
 def fit_groups(motion, covariance, n_field):
@@ -65,9 +78,13 @@ def fit_groups(motion, covariance, n_field):
         total = np.logaddexp.reduce(terms, axis=0)
         now = total.mean()
         if now - before < CLOSE:
-            break
+            return groups
         before = now
         groups = _better(groups, np.exp(terms - total), motion, covariance)
+    warnings.warn(
+        f'The Gaussians of cluster and field still change after {MOST_STEPS} '
+        'steps; there may be no cluster, or memberships are rough.',
+        AstropyUserWarning, stacklevel=4)
     return groups
 
 
@@ -88,18 +105,20 @@ def _start(motion, covariance, n_field):
 
 def _better(groups, belongs, motion, covariance):
     """Return the groups after a step of expectation and maximisation."""
-    own = groups.covariance[:, None]
-    gain = np.swapaxes(np.linalg.solve(own + covariance, np.broadcast_to(
-        own, (len(own), *covariance.shape))), -1, -2)
-    away = motion - groups.mean[:, None]
-    true = groups.mean[:, None] + np.einsum('jnab,jnb->jna', gain, away)
-    left = own - gain @ own
+    own = groups.covariance
+    (x, y), (xx, xy, yy) = groups.seen(motion, covariance)
+    true = groups.mean[:, None] + np.stack(
+        [xx * x + xy * y, xy * x + yy * y], axis=-1) @ own
+    # Of V - V (V + S)^-1 V only the mean of all stars is needed.
+    inverse = np.stack([np.sum(belongs * element, axis=1)
+                        for element in (xx, xy, xy, yy)], axis=-1)
+    left = (belongs.sum(axis=1)[:, None, None] * own
+            - own @ inverse.reshape(-1, 2, 2) @ own)
     weight = np.maximum(belongs.sum(axis=1), 1e-12)
     mean = np.einsum('jn,jna->ja', belongs, true) / weight[:, None]
     from_mean = true - mean[:, None]
-    spread = (np.einsum('jn,jna,jnb->jab', belongs, from_mean, from_mean)
-              + np.einsum('jn,jnab->jab', belongs, left))
-    spread /= weight[:, None, None]
+    spread = np.swapaxes(from_mean * belongs[..., None], 1, 2) @ from_mean
+    spread = (spread + left) / weight[:, None, None]
     # A cluster may have no dispersion that can be seen, but not less.
     least = NARROW * np.trace(spread[-1]) / 2
     return Groups(weight / weight.sum(), mean, spread + least * np.eye(2))

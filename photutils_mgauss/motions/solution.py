@@ -313,6 +313,11 @@ class MotionSolution:
         TypeError, ValueError
             If ``n_field`` is not a positive integer, or too few stars have
             motions.
+
+        Warns
+        -----
+        `~astropy.utils.exceptions.AstropyUserWarning`
+            If the Gaussians still change after 2000 steps.
         """
         n_field = as_integer(n_field, 'n_field', minimum=1)
         return membership_table(self.stars, n_field)

@@ -3,11 +3,13 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable, Table
+from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_allclose
 from scipy.stats import multivariate_normal
 
 from helpers.motion_scenes import TIMES, make_truth, observe
 from photutils_mgauss import Epoch, ProperMotionFitter
+from photutils_mgauss.motions import membership
 from photutils_mgauss.motions.membership import fit_groups
 
 MEAN, FIELD = np.array([2.0, -1.0]), np.array([[9.0, 2.0], [2.0, 6.0]])
@@ -34,6 +36,13 @@ def test_the_mixture_is_found_with_the_errors_taken_out(rng):
     assert_allclose(groups.mean[0], MEAN, atol=0.04)
     assert_allclose(groups.covariance[1], FIELD, atol=0.8)
     assert_allclose(np.sqrt(np.diag(groups.covariance[0])), 0.1, atol=0.06)
+
+
+def test_a_limit_of_steps_is_told(rng, monkeypatch):
+    motion, covariance, _ = motions(rng, 400)
+    monkeypatch.setattr(membership, 'MOST_STEPS', 3)
+    with pytest.warns(AstropyUserWarning, match='still change after 3 steps'):
+        fit_groups(motion, covariance, 1)
 
 
 def test_probabilities_are_the_terms_over_their_sum(rng):
