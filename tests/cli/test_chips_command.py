@@ -94,7 +94,7 @@ def test_the_report_shows_each_chip_and_the_references(camera, tmp_path,
         assert f'Mean residuals of all exposures over chip {chip}' in page
     for number in range(len(YEARS)):
         assert f'Residuals of night{number}.fits' in page
-    assert 'minus those of their catalogue' in page
+    assert 'minus those of the catalogue' in page
     stars = QTable.read('out/motions.ecsv')
     known = np.isfinite(stars['dpmra'].value)
     assert 40 < known.sum() <= 60
