@@ -1005,7 +1005,7 @@ def fit_mixture_field(
     n_components: int | Literal['auto'] | None = None,
     degree: int | Literal['auto'] | None = None, radius: float | None = None,
     local_bkg: bool = False, effective_gain: float | None = None,
-    reject: bool = True, regularization: float | None = None,
+    reject: bool = True, regularization: float = 1.0,
     start: Union[GriddedMixturePSF, None] = None,
     centre: Literal['core', 'flux', 'catalogue'] = 'core',
     normalise: Literal['auto', 'stamps', 'curve-of-growth'] = 'auto',

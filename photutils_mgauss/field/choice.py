@@ -17,8 +17,6 @@ COMPONENTS = (2, 3, 4, 5, 6, 7)
 # one by default: below there is nobody to ask, above it changes little.
 _USUAL_COMPONENTS, _USUAL_DEGREE = 6, 4
 _FEWEST_STARS, MANY_STARS = 8, 60
-# The prior becomes stronger as long as that helps.
-_STRENGTHS = (1.0, 4.0, 16.0)
 # While the number of Gaussians is chosen, the degree is at most this, and the
 # brightest stars decide.
 _DEGREE_FOR_COMPONENTS, _STARS_FOR_COMPONENTS = 2, 100
@@ -56,36 +54,30 @@ def choose(problem, n_components, degree, max_degree, strength, workers):
     n_components, degree : int or 'auto'
     max_degree : int
         The highest degree that the number of stars allows.
-    strength : float or None
-        Of the prior. None is 1, or what is best if the number of Gaussians
-        is chosen for few stars.
+    strength : float
+        Of the prior.
     workers : Workers
 
     Returns
     -------
-    int, int, float, `~astropy.table.QTable`
-        Number of Gaussians, degree, strength, and the chi^2 per pixel of
-        left-out stars for each set that was tried.
+    int, int, `~astropy.table.QTable`
+        Number of Gaussians, degree, and the chi^2 per pixel of left-out
+        stars for each set that was tried.
     """
     tried = QTable(names=('n_components', 'degree', 'regularization',
                           'reduced_chi2'), dtype=(int, int, float, float))
     top = min(_DEGREE_FOR_COMPONENTS,
               max_degree if degree == 'auto' else degree)
     few = _brightest(problem, _STARS_FOR_COMPONENTS)
-    strong = 1.0 if strength is None else strength
 
-    def score(number, strength):
+    def score(number):
         return _score(few, number, top, strength, workers, tried)
     if n_components == 'auto':
-        n_components, found = _climb(
-            lambda k: score(k, strong), _FIRST_COMPONENTS, COMPONENTS)
-        if strength is None and len(problem.basis) < MANY_STARS:
-            strong = _climb(lambda s: found if s == 1 else score(
-                n_components, s), 1.0, _STRENGTHS)[0]
+        n_components = _climb(score, _FIRST_COMPONENTS, COMPONENTS)
     if degree == 'auto':
-        degree = _best_degree(problem, n_components, max_degree, strong,
+        degree = _best_degree(problem, n_components, max_degree, strength,
                               workers, tried)
-    return n_components, degree, strong, tried
+    return n_components, degree, tried
 
 
 def _brightest(problem, n_stars):
@@ -94,7 +86,7 @@ def _brightest(problem, n_stars):
 
 
 def _climb(score, first, steps):
-    """Return the step next to which none is better, and its scores."""
+    """Return the step next to which none is better."""
     place = steps.index(first)
     lowest = score(first)
     for way in (1, -1):
@@ -108,7 +100,7 @@ def _climb(score, first, steps):
             place, lowest = place + way, new
         if place != start:
             break
-    return steps[place], lowest
+    return steps[place]
 
 
 def _score(problem, n_components, top, strength, workers, tried):

@@ -62,7 +62,7 @@ _CENTRE_SIZE, _CENTRE_SHARE = 2.0, 0.36
 
 def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
                       degree=None, radius=None, local_bkg=False,
-                      effective_gain=None, reject=True, regularization=None,
+                      effective_gain=None, reject=True, regularization=1.0,
                       start=None, centre='core', normalise='auto',
                       pixel_integrated='auto', correlated_noise=True,
                       contexts=(), brighter_fatter=False, executor=None,
@@ -127,9 +127,7 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
     regularization : float, optional
         The strength of the prior on the shapes. The prior keeps Gaussians
         apart that the stars cannot distinguish. The stars determine how
-        much the shapes vary over the field. By default 1; if few stars
-        choose the number of Gaussians, they also choose between 1, 4 and
-        16.
+        much the shapes vary over the field.
     start : GriddedMixturePSF, optional
         A known PSF, for example from an archive, or any object with a
         method ``mixture_at``. The fit then only adjusts it: it convolves
@@ -248,7 +246,7 @@ def _tuned_field(problem, sample, radius, degree, options, workers):
     """Return a known PSF as the stars change it."""
     problem.pixel_integrated = options.pixel_integrated
     fit = stages.tune(_known(problem, sample, options.start), degree, workers,
-                      strength=options.strength, reject=options.reject)
+                      strength=options.regularization, reject=options.reject)
     return _tuned(fit, sample, options.start, radius, options.centre)
 
 
@@ -256,7 +254,7 @@ def _free_field(problem, sample, radius, n_components, degree, top, options,
                 workers):
     """Return the field of a PSF of which nothing is known."""
     problem.pixel_integrated = chosen_pixel(
-        problem, options.pixel_integrated, options.strength, workers)
+        problem, options.pixel_integrated, options.regularization, workers)
     fit, choice = _free(problem, n_components, degree, top, workers,
                         options.regularization, options.reject)
     fit, fatter = _fatter(fit, options.brighter_fatter, workers,
@@ -332,7 +330,7 @@ def _with_wings(field, sample, exposures, normalise):
 def _free(problem, n_components, degree, top, workers, strength, reject):
     """Return the fit, and the table of what was tried for it."""
     few = degree == 'auto' and len(problem.basis) < MANY_STARS
-    n_components, degree, strength, choice = choose(
+    n_components, degree, choice = choose(
         problem, n_components, degree if degree == 'auto' else top, top,
         strength, workers)
     fit = stages.run(problem, n_components, degree, workers,

@@ -28,7 +28,7 @@ class FieldOptions:
     local_bkg: bool
     effective_gain: float | None
     reject: bool
-    regularization: float | None
+    regularization: float
     start: object
     centre: str
     normalise: str
@@ -41,12 +41,11 @@ class FieldOptions:
         checked = {
             'n_components': _number(self.n_components, 'n_components', 1),
             'degree': _number(self.degree, 'degree', 0),
+            'regularization': as_real(self.regularization,
+                                      'regularization', above=0),
             'contexts': context_names(self.contexts)}
         if self.radius is not None:
             checked['radius'] = as_real(self.radius, 'radius', minimum=2)
-        if self.regularization is not None:
-            checked['regularization'] = as_real(
-                self.regularization, 'regularization', above=0)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         self._check_words()
@@ -54,11 +53,6 @@ class FieldOptions:
             self._check_known()
         object.__setattr__(self, 'pixel_integrated', _pixel_integrated(
             self.pixel_integrated, self.start))
-
-    @property
-    def strength(self):
-        """The strength of the prior where nothing chooses it."""
-        return self.regularization or 1.0
 
     def size(self, n_stars):
         """Return number of Gaussians and degree, or 'auto', for n stars."""
