@@ -128,7 +128,8 @@ class PSFModel(Fittable2DModel):
         astropy's fitters leave out: what they move is the sum of the columns
         times the derivatives of the ties.
         """
-        if not self.has_tied:
+        # Not has_tied, for which astropy makes a dict of all parameters.
+        if not any(getattr(self, name).tied for name in self.param_names):
             return columns
         values = np.array([float(np.squeeze(v)) for v in values])
         free = [i for i, name in enumerate(self.param_names)

@@ -436,8 +436,11 @@ def _in_runs(data):
     constant = np.zeros(data.shape, bool)
     if data.shape[1] <= length:
         return constant
-    same = np.cumsum(np.diff(data, axis=1) == 0, axis=1)
-    same = np.pad(same, ((0, 0), (1, 0)))
+    equal = np.diff(data, axis=1) == 0
+    # Of most images nothing more has to be known.
+    if np.count_nonzero(equal) < length:
+        return constant
+    same = np.pad(np.cumsum(equal, axis=1), ((0, 0), (1, 0)))
     whole = same[:, length:] - same[:, :-length] == length
     for i in range(length + 1):
         constant[:, i:i + whole.shape[1]] |= whole
