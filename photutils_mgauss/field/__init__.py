@@ -1,15 +1,15 @@
-"""
-The PSF of an image, made of the image's own stars.
+"""The PSF of an image, made from stars of the same image.
 
-`selection` chooses the stars, `input` and `stamps` cut them out, `fit` has
-`fit_mixture_field`, which goes through `stages` of rising degree and drops
-what does not fit, on the normal equations of `normal` for the forms of
-`forms`; `choice` validates numbers of Gaussians and degrees, `beyond`
-adds one more degree for few stars, `covariance`, `noise` and `misfit` say how
-far all may be off, `growth` measures the light beyond the stamps. The results
-are `mixture_field`, `tuned_field` and, with pixels on top, `empirical`, all on
-`base`. A field gives a mixture at any place and a grid for the room
-`photometry`; it knows neither sky nor time.
+`fit` has `fit_mixture_field`. `selection` chooses stars, `input` and `stamps`
+cut them out, and `stages` fits fields of rising degree and drops stars that do
+not fit; `normal` adds up the normal equations and `forms` has the kinds of
+field they are for. `choice` validates numbers of Gaussians and degrees with
+stars left out of the fit, and `beyond` adds one more degree when there are few
+stars. `covariance`, `noise` and `misfit` give the errors of the field, and
+`growth` measures the light beyond the stamps. The results are `mixture_field`,
+`tuned_field` and `empirical`, a PSF of pixels, all on `base`. A field gives a
+mixture at any place and a grid for the room `photometry`; it knows neither sky
+nor time.
 """
 from photutils_mgauss.utils.lazy import hand_on
 

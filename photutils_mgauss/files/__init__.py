@@ -1,18 +1,16 @@
-"""
-Every reader and writer of files.
+"""All readers and writers of files.
 
-`psfex` reads PSFEx models and `epsfs` the ePSFs of other programs, `storage`
-and `layout` write this package's own objects as tables of plain columns in
-FITS and ASDF files and read them back to the last bit, `asdf_extension` is
-what the asdf library needs to know; `image_layers` and `image_header` turn
-image files into values, errors, flags, a WCS and a time, `tables` reads tables
-of stars. All of them open files with `fits_files` and `asdf_files`, which
-believe no size that a header tells, and turn whatever is wrong with a file
-into the one error of `damage`; all that is written goes through `whole`, so
-that a file is whole or not there. A format that a user hands in or takes home
-belongs here; what is done with its numbers does not, so nothing here imports a
-PSF class at the top of a module. Tags and schemas are promises to files that
-exist: add versions, change none.
+`psfex` reads PSFEx models and `epsfs` the ePSFs of other programs. `storage`
+and `layout` write the objects of this package as plain columns of FITS and
+ASDF tables and read them back without losing a bit; `asdf_extension` registers
+them with the asdf library. `image_layers` and `image_header` read images:
+values, errors, flags, WCS and time. `tables` reads tables of stars. All
+readers open files through `fits_files` and `asdf_files`, which check the sizes
+that headers declare, and turn every fault of a file into the error of
+`damage`. All writers go through `whole`, which leaves either a complete file
+or none. Reading and writing belongs here, computing does not: no module here
+imports a PSF class when it is imported. Tags and schemas are promises to
+existing files: add versions, but never change one.
 """
 from photutils_mgauss.utils.lazy import hand_on
 

@@ -1,13 +1,12 @@
-"""
-PSF images to mixtures and grids of them, by least squares or PyMC.
+"""Mixtures fitted to PSF images, by least squares or with PyMC.
 
-`image` has `fit_mixture` for one image or a stack, `search` the search for
-the starts of a fit, `grid`, `nodes` and `node_images` the fits at all nodes
-of a detector grid, from whatever source, with their report; `phases` tells
-what residuals do to positions. `posterior` samples the same model with PyMC,
-as `posterior_model` writes it down, `n_components` compares numbers of
-Gaussians. The images are PSFs, sampled finely or not; stars of an image, with
-noise and neighbours, are the business of the room `field`.
+`image` has `fit_mixture` for one image or a stack of images, and `search`
+finds the starting points of a fit. `grid`, `nodes` and `node_images` fit all
+nodes of a detector grid, whatever its source, and report on each; `phases`
+computes the errors of positions that residuals cause. `posterior` samples the
+posterior of `posterior_model` with PyMC, and `n_components` compares numbers
+of Gaussians. The images here are PSFs, at any sampling; stars of an image,
+with noise and neighbours, belong to the room `field`.
 """
 from photutils_mgauss.utils.lazy import hand_on
 

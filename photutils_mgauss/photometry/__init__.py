@@ -1,14 +1,13 @@
-"""
-Positions and fluxes of stars, one star or group at a time.
+"""Positions and fluxes of stars, one star or group at a time.
 
-`psf_photometry` has `MixturePSFPhotometry`, photutils' class with the fits in
-compiled code: `engine` fits, spread over threads, and `table` puts the
-numbers into photutils' columns; `flags` says in words what the bits of their
-flags mean. `fitter` is a fitter for photutils' own
-classes, `noise` the noise of pixels and the bound it sets, `pixel_phase` the
-errors of position against the sub-pixel phase. `many_images` fits one place
-of the sky in many images, and is the only module that needs both PSFs and the
-sky. Names of columns, keywords and flags are photutils'.
+`psf_photometry` has `MixturePSFPhotometry`, photutils' class with its fits in
+compiled code: `engine` fits the stars in several threads, `table` fills
+photutils' columns, and `flags` gives the meaning of each flag. `fitter` is a
+fitter for photutils' own classes, `noise` has the noise of pixels and the
+Cramer-Rao bound, and `pixel_phase` the errors of position as a function of the
+sub-pixel phase. `many_images` fits one position on the sky to many images; it
+is the only module here that needs both a PSF and a WCS. Columns, keywords and
+flags have photutils' names.
 """
 from photutils_mgauss.utils.lazy import hand_on
 

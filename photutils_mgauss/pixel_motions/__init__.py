@@ -1,18 +1,17 @@
-"""
-Stars fitted to the pixels of all epochs together: positions, motions, fluxes.
+"""Positions, motions and fluxes of stars from the pixels of all epochs.
 
-A catalogue of one epoch has no entry for a star that is too faint to be found
-there, and a motion made of catalogues knows nothing of it. Here a star that
-moves is one model of all images at once, so that images count that do not
-show it by themselves. Start at `fitter`, which has the public class. `epoch`
-is one image and where and when it was taken, `campaign` all of them read for
-the fit, `stars` the list of stars that the user gives, `solve` the fit with
-neighbours, `posterior` what stands for the peak of the likelihood of faint
-stars, `refine` the frames from bright stars, `errors` what frames and PSFs add
-to the errors of stars, `tables` and `cutouts` what comes out, `find` the
-search for stars in the evidence of all images. The fit itself is
-`photometry.joint_pixels`, which `fit_many` uses for stars at rest; frames come
-from `motions`.
+The catalogue of one epoch does not list a star that is too faint to be
+detected there, so motions from catalogues miss it. Here a moving star is one
+model of all images at once, and images count that do not show it by
+themselves. Start at `fitter`, which has the public class. `epoch` is one image
+with its place and time, `campaign` all images prepared for the fit, and
+`stars` the list of stars from the user. `solve` fits stars with their
+neighbours, `posterior` replaces the peak of the likelihood by its mean for
+faint stars, `refine` solves for the frames with bright stars, `errors` adds
+what frames and PSFs contribute to the errors, `tables` and `cutouts` are
+results, and `find` searches for stars in all images together. The fit itself
+is `photometry.joint_pixels`, which `fit_many` uses for stars at rest; the
+frames come from `motions`.
 """
 from photutils_mgauss.utils.lazy import hand_on
 

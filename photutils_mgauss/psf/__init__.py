@@ -1,14 +1,13 @@
-"""
-What a PSF is: mixtures of Gaussians, the astropy models, grids, shapes.
+"""PSFs: mixtures of Gaussians, astropy models, grids and their shapes.
 
-`mixture` has `GaussianMixture`, a frozen value with its algebra; `model` and
-`gridded` are the two astropy models, drop-in for photutils, on what `base`
-has in common for them; `grid` is a detector grid as arrays, `local` the same
-at the places of many stars, `renderer` draws them on an image, `convert` is
-what other programs call a PSF.
-`shapes` measures sizes and ellipticities, `assessment` compares them with a
-truth. Nothing here fits an image: constructors that must fit call the room
-`fitting` when they are called.
+`mixture` has `GaussianMixture`, a frozen value with its algebra. `model` and
+`gridded` are the two astropy models that photutils accepts; `base` is what
+they share. `grid` holds a detector grid as arrays, `local` the grid at the
+places of many stars, `renderer` draws stars on an image, and `convert`
+translates from and to the PSFs of other programs. `shapes` measures sizes and
+ellipticities and `assessment` compares them with a known truth. Nothing here
+fits images: constructors that need a fit call the room `fitting` when they
+run.
 """
 from photutils_mgauss.utils.lazy import hand_on
 
