@@ -7,7 +7,6 @@ from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.star_normal import (
     Pixels,
     find_reach,
-    gather,
     normal_equations,
 )
 from photutils_mgauss.kernels.tile import fill_derivatives
@@ -18,54 +17,51 @@ from photutils_mgauss.kernels.tile import fill_derivatives
 # about the group that chi2 needs, whatever the fluxes are.
 
 
+class GroupPixels(NamedTuple):
+    """
+    The pixels of g groups of m boxes, in one image.
+
+    boxes (g, m, 4), their data and weights (g, m, area), column after column;
+    the sums of weighted squares of the data and the numbers of pixels that
+    count (g,), which `weigh_groups` finds.
+    """
+
+    boxes: np.ndarray
+    data: np.ndarray
+    weights: np.ndarray
+    squares: np.ndarray
+    n_pixels: np.ndarray
+
+
 class GroupMoments(NamedTuple):
     """
-    Moments of g groups, each of k basis images.
+    Moments of g groups in e images, of k = 3 m basis images, less the sky.
 
-    Products of the basis images (g, k, k), of these with the data (g, k), of
-    the data with themselves (g,), and the number of pixels (g,), -1 where an
-    error is not positive and finite.
+    Products of the basis images (g, e, k, k), of these with the data
+    (g, e, k), of the data with themselves (g, e), and the numbers of pixels
+    (g, e). sky (g, e, 2 + k) has the weight of a constant, its product with
+    the data and with the basis images; it is 0 without one.
     """
 
     products: np.ndarray
     data: np.ndarray
     squares: np.ndarray
     n_pixels: np.ndarray
+    sky: np.ndarray
 
 
 @inner
 def _leave_repeats(boxes, c, weight):
-    """
-    Leave the pixels of box c out that an earlier box has, too.
-
-    Returns the number of pixels left out that had a weight.
-    """
+    """Leave the pixels of box c out that an earlier box has, too."""
     row, column, height, width = boxes[c]
-    n = 0
     for e in range(c):
         top, left = boxes[e, 0], boxes[e, 1]
         bottom, right = top + boxes[e, 2], left + boxes[e, 3]
         for i in range(width):
             for j in range(height):
-                k = i * height + j
                 y, x = row + j, column + i
-                if (top <= y < bottom and left <= x < right
-                        and weight[k] > 0):
-                    weight[k] = 0.0
-                    n += 1
-    return n
-
-
-@inner
-def _load(image, boxes, data, weights):
-    """Fetch the pixels of a group, each once; return how many there are."""
-    total = 0
-    for c in range(boxes.shape[0]):
-        n = gather(image, boxes[c], 0.0, data[c], weights[c])
-        if n < 0:
-            return -1
-        total += n - _leave_repeats(boxes, c, weights[c])
-    return total
+                if top <= y < bottom and left <= x < right:
+                    weight[i * height + j] = 0.0
 
 
 @inner
@@ -84,61 +80,124 @@ def _add_own(boxes, own, psf, scratch, data):
 
 
 @inner
-def _put(equations, pixels, m, size, g, out):
-    """Put the moments of group g, from equations at fluxes of 1."""
-    for a in range(size):
-        for b in range(a + 1):
-            out.products[g, a, b] = equations.matrix[a, b]
-            out.products[g, b, a] = equations.matrix[a, b]
-    for a in range(size):
-        total = equations.gradient[a]
-        for s in range(m):
-            total += out.products[g, a, 3 * s]
-        out.data[g, a] = total
-    squares = 0.0
-    for c in range(m):
-        for k in range(pixels.boxes[c, 2] * pixels.boxes[c, 3]):
-            squares += equations.weights[c, k] * pixels.data[c, k] ** 2
-    out.squares[g] = squares
-
-
-@inner
-def _blank(g, out):
-    """Give group g the moments of no pixels."""
-    for a in range(out.data.shape[1]):
-        out.data[g, a] = 0.0
-        for b in range(out.data.shape[1]):
-            out.products[g, a, b] = 0.0
-    out.squares[g] = 0.0
+def _weigh_box(data, weights, light, unit):
+    """Scale the pixels of a box and weigh them; return whether all can be."""
+    for k in range(data.size):
+        if not abs(data[k]) < np.inf:
+            data[k] = 0.0
+            weights[k] = 0.0
+            continue
+        if not 0 < weights[k] < np.inf:
+            return False
+        data[k] /= unit
+        if light.size:
+            data[k] -= light[k]
+        weights[k] = (unit / weights[k]) ** 2
+    return True
 
 
 @kernel
-def group_moments(image, boxes, places, own, psf, parameters, scratch, out):
+def weigh_groups(pixels, light, unit, own, psf, scratch):
     """
-    Find the moments of g groups of m stars.
+    Turn pixels as they are in an image into those of a fit.
 
-    Pixels are those of the boxes (g, m, 4); the PSFs are at places (g, m, 2).
-    own (g, m, 3), or (0, m, 3) for none, is light (flux, x, y) to add to the
-    image, from which stars have been subtracted. A sky is there if out has
-    room for it. Worked on are parameters (3 m + 1,), all 0, and a BoxScratch.
+    The data of pixels are in the unit of the image, infinite or NaN where
+    they do not count, and the weights are errors. Both are put into a unit of
+    light that is 1 there. light (g, m, area), or (0, 0, 0) for none, is what
+    is to be subtracted then, and own (g, m, 3), or (0, m, 3), light of stars
+    (flux, x, y) to add. Pixels that boxes of a group share count once. The
+    number of pixels is -1 where an error is not positive and finite. scratch
+    is a Scratch.
     """
-    m, size = boxes.shape[1], out.data.shape[1]
-    data, weights, new, around, chi2 = scratch
+    nothing = light[:0, 0, 0]
+    for g in range(pixels.boxes.shape[0]):
+        boxes = pixels.boxes[g]
+        squares = 0.0
+        n = 0
+        for c in range(boxes.shape[0]):
+            used = boxes[c, 2] * boxes[c, 3]
+            sound = _weigh_box(
+                pixels.data[g, c, :used], pixels.weights[g, c, :used],
+                light[g, c, :used] if light.size else nothing, unit)
+            if not sound:
+                pixels.n_pixels[g] = -1
+                return
+        if own.shape[0]:
+            _add_own(boxes, own[g], psf, scratch, pixels.data[g])
+        for c in range(boxes.shape[0]):
+            data, weights = pixels.data[g, c], pixels.weights[g, c]
+            _leave_repeats(boxes, c, weights)
+            for k in range(boxes[c, 2] * boxes[c, 3]):
+                squares += weights[k] * data[k] ** 2
+                n += weights[k] > 0
+        pixels.squares[g] = squares
+        pixels.n_pixels[g] = n
+
+
+@inner
+def _put_sky(equations, m, products, data, sky):
+    """Eliminate the sky; return what the data lose of their squares."""
+    size = 3 * m
+    row = equations.matrix[size]
+    weight, light = row[size], equations.gradient[size]
+    for s in range(m):
+        light += row[3 * s]
+    sky[0], sky[1] = weight, light
+    if not weight > 0:
+        return 0.0
+    for a in range(size):
+        sky[2 + a] = row[a]
+        share = row[a] / weight
+        data[a] -= share * light
+        for b in range(size):
+            products[a, b] -= share * row[b]
+    return light * light / weight
+
+
+@inner
+def _put(equations, m, products, data):
+    """Put the moments of a group, from equations at fluxes of 1."""
+    matrix = equations.matrix
+    for a in range(3 * m):
+        for b in range(a + 1):
+            products[a, b] = matrix[a, b]
+            products[b, a] = matrix[a, b]
+        data[a] = equations.gradient[a]
+    for a in range(3 * m):
+        for s in range(m):
+            data[a] += products[a, 3 * s]
+
+
+@kernel
+def group_moments(pixels, rows, places, psf, fit_sky, image, parameters,
+                  scratch, out):
+    """
+    Find the moments of some groups of m stars in one image.
+
+    The groups are those of the GroupPixels in rows (g,), the PSFs are at
+    places (g, m, 2), and image is where in out, which is all 0, they go.
+    Worked on are parameters (3 m + 1,), all 0, and a BoxScratch.
+    """
+    m = pixels.boxes.shape[1]
+    _, _, new, around, chi2 = scratch
     if m > 1:  # a single star is always looked at
         find_reach(psf, around.sight)
-    for g in range(boxes.shape[0]):
-        n_pixels = _load(image, boxes[g], data, weights)
-        out.n_pixels[g] = n_pixels
-        if n_pixels <= 0:
-            _blank(g, out)
+    for g in range(rows.size):
+        r = rows[g]
+        out.n_pixels[g, image] = pixels.n_pixels[r]
+        if pixels.n_pixels[r] == 0:
             continue
-        if own.shape[0]:
-            _add_own(boxes[g], own[g], psf, around, data)
         for s in range(m):
             parameters[3 * s] = 1.0
             parameters[3 * s + 1] = places[g, s, 0]
             parameters[3 * s + 2] = places[g, s, 1]
-        pixels = Pixels(boxes[g], data, weights, 0.0)
-        normal_equations(parameters, m, size > 3 * m, pixels, psf, around,
-                         new, new, chi2)
-        _put(new, pixels, m, size, g, out)
+        group = Pixels(pixels.boxes[r], pixels.data[r], pixels.weights[r],
+                       0.0)
+        normal_equations(parameters, m, fit_sky, group, psf, around, new, new,
+                         chi2)
+        products, data = out.products[g, image], out.data[g, image]
+        _put(new, m, products, data)
+        out.squares[g, image] = pixels.squares[r]
+        if fit_sky:
+            out.squares[g, image] -= _put_sky(new, m, products, data,
+                                              out.sky[g, image])

@@ -19,14 +19,19 @@ eliminated. Groups of m neighbours are fitted together: v is that of all.
 
 Arrays have the g groups first: (g, m, p) parameters, (g, E, m) of E images.
 """
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.photometry.engine import cut_boxes
+from photutils_mgauss.utils.parallel import map_parallel
 
 _MAX_STEPS = 60
+
+# Groups handed to a thread at a time, times stars in each, squared.
+_CHUNK = 2000
 
 # Of the next step [pix], as for single images.
 TOLERANCE = 1e-6
@@ -77,7 +82,7 @@ class JointImages:
 
     Attributes
     ----------
-    images : list of `~photutils_mgauss.kernels.Image`
+    images : list of `~photutils_mgauss.photometry.box_pixels.ScaledImage`
     psfs : list of tuple
         See `~photutils_mgauss.photometry.engine.psf_arrays`.
     shared : (E,) `~numpy.ndarray` of int
@@ -96,23 +101,20 @@ class JointImages:
         """The number of different fluxes of a star."""
         return int(self.shared.max()) + 1
 
-    def moments(self, k, boxes, places, own):
-        """Return the moments of groups in image k, the sky among them."""
-        n, m = boxes.shape[:2]
-        size = 3 * m + self.fit_sky
-        out = kernels.GroupMoments(
-            np.empty((n, size, size)), np.empty((n, size)), np.empty(n),
-            np.empty(n, np.int64))
-        kernels.group_moments(self.images[k], boxes,
-                              np.ascontiguousarray(places), own, self.psfs[k],
-                              np.zeros(3 * m + 1), kernels.BoxScratch.empty(
-                                  m, boxes.reshape(-1, 4)), out)
-        if (out.n_pixels < 0).any():
+    def groups(self, k, boxes, own):
+        """
+        Return the `~photutils_mgauss.kernels.GroupPixels` of image k.
+
+        ``boxes`` (g, m, 4) are those of the stars, ``own`` (g, m, 3) light to
+        add, or None.
+        """
+        pixels = self.images[k].groups(boxes, own, self.psfs[k])
+        if (pixels.n_pixels < 0).any():
             msg = ('images must have positive and finite errors under the '
                    f'stars, got one that is not in image {k}; mask such '
                    'pixels')
             raise ValueError(msg)
-        return out
+        return pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,36 +141,28 @@ class Moments:
     sky: np.ndarray
 
     @classmethod
-    def of(cls, joint, boxes, places, own):
-        """Return those at places (g, E, m, 2)."""
-        n, n_images, m = boxes.shape[:3]
-        size = 3 * m
-        out = cls(np.empty((n, n_images, size, size)),
-                  np.empty((n, n_images, size)), np.empty((n, n_images)),
-                  np.empty((n, n_images), np.int64),
-                  np.zeros((n, n_images, 2 + size)))
-        for k in range(n_images):
-            mine = np.empty((0, m, 3)) if own is None else (
-                np.ascontiguousarray(own[:, k]))
-            out._fill(k, joint.moments(
-                k, np.ascontiguousarray(boxes[:, k]), places[:, k], mine))
-        return out
+    def of(cls, joint, pixels, rows, places):
+        """
+        Return those of some groups (r,) at places (r, E, m, 2).
 
-    def _fill(self, k, raw):
-        size = self.data.shape[2]
-        self.n_pixels[:, k] = raw.n_pixels
-        self.products[:, k] = raw.products[:, :size, :size]
-        self.data[:, k] = raw.data[:, :size]
-        self.squares[:, k] = raw.squares
-        if raw.data.shape[1] == size:
-            return
-        weight, light = raw.products[:, -1, -1], raw.data[:, -1]
-        cross = raw.products[:, -1, :size]
-        self.sky[:, k] = np.column_stack([weight, light, cross])
-        share = cross / np.where(weight > 0, weight, 1)[:, None]
-        self.products[:, k] -= share[:, :, None] * cross[:, None, :]
-        self.data[:, k] -= share * light[:, None]
-        self.squares[:, k] -= light**2 / np.where(weight > 0, weight, 1)
+        ``pixels`` are the `~photutils_mgauss.kernels.GroupPixels` of all
+        groups in each image.
+        """
+        n, n_images, m = places.shape[:3]
+        size = 3 * m
+        out = cls(np.zeros((n, n_images, size, size)),
+                  np.zeros((n, n_images, size)), np.zeros((n, n_images)),
+                  np.zeros((n, n_images), np.int64),
+                  np.zeros((n, n_images, 2 + size)))
+        arrays = kernels.GroupMoments(*(getattr(out, f.name)
+                                        for f in fields(cls)))
+        for k, image in enumerate(pixels):
+            kernels.group_moments(
+                image, rows, np.ascontiguousarray(places[:, k]),
+                joint.psfs[k], joint.fit_sky, k, np.zeros(size + 1),
+                kernels.BoxScratch.empty(m, image.boxes.reshape(-1, 4)),
+                arrays)
+        return out
 
     def levels(self, fluxes):
         """Return the sky (g, E) at fluxes (g, E, m)."""
@@ -217,6 +211,12 @@ class State:
         for f in fields(self):
             getattr(self, f.name)[rows[where]] = getattr(other, f.name)[where]
 
+    @classmethod
+    def joined(cls, parts):
+        """Return the state of all groups of several."""
+        return cls(*(np.concatenate([getattr(one, f.name) for one in parts])
+                     for f in fields(cls)))
+
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
@@ -244,6 +244,28 @@ class JointFit:
     own: np.ndarray | None = None
     least_gain: float = 1e-10
 
+    def parts(self):
+        """Return the fits of a few groups each, for threads."""
+        n, _, m = self.boxes.shape[:3]
+        size = max(1, _CHUNK // m**2)
+        return [self._part(slice(i, i + size))
+                for i in range(0, max(n, 1), size)]
+
+    def _part(self, rows):
+        views = Views(*(getattr(self.views, f.name)[rows]
+                        for f in fields(Views)))
+        return replace(self, views=views, boxes=self.boxes[rows],
+                       free=self.free[rows],
+                       own=None if self.own is None else self.own[rows])
+
+    @cached_property
+    def _pixels(self):
+        """The `~photutils_mgauss.kernels.GroupPixels` of each image."""
+        return [self.joint.groups(
+            k, np.ascontiguousarray(self.boxes[:, k]),
+            None if self.own is None else np.ascontiguousarray(
+                self.own[:, k])) for k in range(self.boxes.shape[1])]
+
     def evaluate(self, values, rows):
         """Return the `State` of some groups (r,) at values (r, m, p)."""
         return _state(self.joint, values, self.views.slopes[rows],
@@ -252,11 +274,9 @@ class JointFit:
     def _moments(self, values, rows):
         """Return the `Moments` of some groups (r,) at values (r, m, p)."""
         places = self.views.places(values, rows)
-        boxes = self.boxes[rows]
-        seen = boxes[..., 2:].all(axis=-1)
-        places = np.where(seen[..., None], places, 0.0)
-        return Moments.of(self.joint, boxes, places,
-                          None if self.own is None else self.own[rows])
+        seen = self.boxes[rows][..., 2:].all(axis=-1)
+        return Moments.of(self.joint, self._pixels, rows,
+                          np.where(seen[..., None], places, 0.0))
 
     def minimize(self):
         """Return the `State` at the least chi2, and who converged (g,)."""
@@ -306,6 +326,17 @@ class JointFit:
             light[:, c] += moments.data[:, k, 0]
             weight[:, c] += moments.products[:, k, 0, 0]
         return light, weight
+
+
+def minimize_all(fit):
+    """Return what `JointFit.minimize` does, in threads, a few at a time."""
+    states, done = zip(*map_parallel(_minimized, fit.parts(), long=True),
+                       strict=True)
+    return State.joined(states), np.concatenate(done)
+
+
+def _minimized(fit):
+    return replace(fit).minimize()  # the pixels it takes out go with it
 
 
 def boxes_around(pixels, fit_shape, shapes):

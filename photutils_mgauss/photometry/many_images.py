@@ -20,10 +20,10 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
+from photutils_mgauss.photometry.box_pixels import ScaledImage
 from photutils_mgauss.photometry.engine import (
     as_model,
     is_fixed_shape,
-    kernel_image,
     psf_arrays,
 )
 from photutils_mgauss.photometry.joint_pixels import (
@@ -33,6 +33,7 @@ from photutils_mgauss.photometry.joint_pixels import (
     Views,
     boxes_around,
     covariances,
+    minimize_all,
 )
 from photutils_mgauss.sky.observers import add_aberration
 from photutils_mgauss.sky.pixel_grid import PixelGrid
@@ -302,24 +303,26 @@ def fit_many(images, coordinates, *, fit_shape=11, common_flux=False):
         plane = TangentPlane.around(vectors)
         state, converged = _fit_places(joint, frames, plane,
                                        plane.project(vectors), fit_shape)
-        weighted = all(image.error.size for image in joint.images)
+        weighted = all(one.error is not None for one in pixels)
         return _table(state, converged, plane, scale, units[0], weighted)
 
 
-def joint_images(pixels, psfs, shared, *, fit_sky):
+def joint_images(pixels, psfs, shared, *, fit_sky, factors=None):
     """
     Return images as fits of many take them, and the unit of their light.
 
     Parameters
     ----------
     pixels : sequence of `~photutils_mgauss.utils.image.PixelData`
-        All in one unit.
+        They are not copied.
     psfs : sequence of `~photutils_mgauss.psf.base.PSFModel`
         Of fixed shape.
     shared : (E,) `~numpy.ndarray` of int
         The number of the flux of each image.
     fit_sky : bool
         Whether each star has a sky in each image.
+    factors : (E,) sequence of float, optional
+        What turns the units of the pixels into one; all 1 by default.
 
     Returns
     -------
@@ -328,11 +331,12 @@ def joint_images(pixels, psfs, shared, *, fit_sky):
         The light that counts as 1 there: of the order of the noise, so that
         nothing is lost to rounding whatever the unit is.
     """
-    levels = [_typical(one.with_error().error) for one in pixels]
-    scale = float(np.median(levels))
-    images = [kernel_image(one.data / scale, None if one.error is None
-                           else one.error / scale, one.mask)
-              for one in pixels]
+    factors = np.ones(len(pixels)) if factors is None else factors
+    scale = float(np.median([
+        _typical(one.with_error().error) * factor
+        for one, factor in zip(pixels, factors, strict=True)]))
+    images = [ScaledImage(one, scale / factor)
+              for one, factor in zip(pixels, factors, strict=True)]
     return JointImages(images, [psf_arrays(psf) for psf in psfs],
                        np.asarray(shared), fit_sky), scale
 
@@ -347,7 +351,7 @@ def _typical(error):
 def _fit_places(joint, frames, plane, origin, fit_shape):
     """Return the state of all stars at rest, and who converged."""
     n, rest = origin.shape[1], np.eye(2)[:, :, None]
-    shapes = [image.data.shape for image in joint.images]
+    shapes = [image.pixels.shape for image in joint.images]
     values = np.ascontiguousarray(origin.T)[:, None]
     fit = None
     for _ in range(3):
@@ -361,7 +365,7 @@ def _fit_places(joint, frames, plane, origin, fit_shape):
         boxes = (boxes_around(views.pixels, fit_shape, shapes)
                  if fit is None else fit.boxes)
         fit = JointFit(joint, views, boxes, np.ones((n, 1, 2), bool))
-        state, converged = fit.minimize()
+        state, converged = minimize_all(fit)
         values = state.values
     return state, converged
 

@@ -38,8 +38,6 @@ class Campaign:
         What is fitted beside positions and motions.
     estimated : tuple of int
         The images whose errors were estimated.
-    original : list of `~photutils_mgauss.kernels.Image`
-        The images with the light of all stars.
     """
 
     epochs: list
@@ -51,7 +49,6 @@ class Campaign:
     parallax: bool
     acceleration: bool
     estimated: tuple
-    original: list
 
     @property
     def n_images(self):
@@ -142,8 +139,10 @@ class Campaign:
         free[enough] = True
         return free, enough
 
-    def without(self, images):
-        """Return this campaign with other `~kernels.Image`."""
+    def without(self, lights):
+        """Return this campaign with other light (ny, nx) subtracted."""
+        images = [replace(image, light=light) for image, light in zip(
+            self.joint.images, lights, strict=True)]
         return replace(self, joint=replace(self.joint, images=images))
 
 
@@ -159,18 +158,17 @@ def _periods(years, seen):
 def read_campaign(images, *, flux, fit_sky, parallax, acceleration):
     """Return the `Campaign` of a sequence of `ImageEpoch`."""
     epochs = _check(images)
-    unit = epochs[0].pixels.unit
-    pixels = [_in_unit(epoch.pixels, unit, k)
-              for k, epoch in enumerate(epochs)]
-    estimated = tuple(k for k, one in enumerate(pixels) if one.error is None)
+    pixels = [epoch.pixels for epoch in epochs]
+    unit = pixels[0].unit
     joint, scale = joint_images(
         [one.with_error() for one in pixels],
         [epoch.model for epoch in epochs], _shared(epochs, flux),
-        fit_sky=fit_sky)
+        fit_sky=fit_sky, factors=[_factor(one.unit, unit, k)
+                                  for k, one in enumerate(pixels)])
+    estimated = tuple(k for k, one in enumerate(pixels) if one.error is None)
     years = np.array([epoch.year for epoch in epochs])
     return Campaign(epochs, joint, scale, unit, _plane(epochs),
-                    float(years.mean()), parallax, acceleration, estimated,
-                    joint.images)
+                    float(years.mean()), parallax, acceleration, estimated)
 
 
 def _check(images):
@@ -189,20 +187,16 @@ def _check(images):
     return epochs
 
 
-def _in_unit(pixels, unit, k):
-    """Return the pixels of image k in the unit of the first image."""
-    own = pixels.unit
+def _factor(own, unit, k):
+    """Return what turns the unit of image k into that of the first image."""
     if own == unit:
-        return pixels
+        return 1.0
     if own is None or unit is None or not own.is_equivalent(unit):
         msg = ('images must have units that can be converted into that of '
                f'the first, {unit or "none"}, got {own or "none"} in image '
                f'{k}')
         raise ValueError(msg)
-    factor = own.to(unit)
-    return replace(pixels, data=pixels.data * factor, unit=unit,
-                   error=None if pixels.error is None
-                   else pixels.error * factor)
+    return own.to(unit)
 
 
 def _shared(epochs, flux):

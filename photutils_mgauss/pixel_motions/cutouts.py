@@ -25,7 +25,7 @@ def cutout_table(campaign, solved, star, size):
     for row, k in enumerate(images):
         first = np.rint(place[row]).astype(int) - (np.array(size[::-1]) - 1
                                                    ) // 2
-        stamps[0, row] = _data(campaign.original[k], first, size)
+        stamps[0, row] = _data(campaign.joint.images[k], first, size)
         stamps[0, row] -= np.nan_to_num(solved.sky[star, k])
         stamps[1, row] = _model(campaign, solved, k, first, size)
     unit = campaign.scale * light_unit(campaign)
@@ -38,16 +38,13 @@ def cutout_table(campaign, solved, star, size):
 def _data(image, first, size):
     """Return the pixels of a stamp, NaN for those that are not used."""
     out = np.full(size, np.nan)
-    height, width = image.data.shape
+    height, width = image.pixels.shape
     rows, columns = (np.arange(start, start + n) for start, n in zip(
         first[::-1], size, strict=True))
     inside = np.ix_((rows >= 0) & (rows < height),
                     (columns >= 0) & (columns < width))
     at = np.ix_(rows[inside[0].ravel()], columns[inside[1].ravel()])
-    pixels = image.data[at]
-    if image.mask.size:
-        pixels = np.where(image.mask[at], np.nan, pixels)
-    out[inside] = pixels
+    out[inside] = image.values(at)
     return out
 
 

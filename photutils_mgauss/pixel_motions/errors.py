@@ -193,7 +193,7 @@ def _psf_shifts(campaign, solved, k, fit_shape, executor):
     known = known_errors(model)
     out = np.zeros((len(solved.values), 3, known.changes.shape[1]))
     out[seen] = np.nan_to_num(StarPixels(
-        campaign.original[k], known, values, fit_shape,
+        campaign.joint.images[k].whole(), known, values, fit_shape,
         fit_sky=campaign.joint.fit_sky,
         integrated=model.pixel_integrated).shifts(executor))
     return out

@@ -275,8 +275,8 @@ def _pixels_on(campaign, grid, k):
 
 def _filtered(campaign, k, light):
     """Return the sums n and m of image k, star light subtracted."""
-    image = campaign.original[k]
-    data, variance = image.data.copy(), np.square(image.error)
+    image = campaign.joint.images[k].whole()
+    data, variance = image.data, np.square(image.error)
     good = np.isfinite(data) & (variance > 0) & np.isfinite(variance)
     if image.mask.size:
         good &= ~image.mask

@@ -11,7 +11,6 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
-from photutils_mgauss.kernels import Image
 from photutils_mgauss.photometry.joint_pixels import (
     JointFit,
     State,
@@ -23,9 +22,6 @@ from photutils_mgauss.pixel_motions.posterior import posterior
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.utils.parallel import map_parallel
 from photutils_mgauss.utils.waiting import progress
-
-# Groups handed to a thread at a time, times stars in each, squared.
-_CHUNK = 2000
 
 # Neighbours nearer than this are fitted together, in units of the PSF's FWHM,
 # and at most so many: a group of more costs more than it brings.
@@ -274,45 +270,36 @@ def _fit_of(campaign, views, fit_shape, forced, own):
                                  campaign.years)
     free = np.zeros_like(free) if forced else free
     return (JointFit(campaign.joint, views, boxes, free.reshape(n, m, -1),
-                     own), enough.reshape(n, m))
+                     own, least_gain=_LEAST_GAIN), enough.reshape(n, m))
 
 
 def _minimize(fit, spread_over, region):
     """Return the `_Part` of a fit, in pieces spread over threads."""
     fit, enough = fit
-    n, _, m, _ = fit.views.pixels.shape
-    size = max(1, _CHUNK // m**2)
-    pieces = [_piece(fit, region, slice(i, i + size))
-              for i in range(0, n, size)]
-    results = spread_over(partial(_run, fit.joint), pieces)
-    state = State(*(np.concatenate([getattr(one, f.name)
-                                    for one, *_ in results])
-                    for f in fields(State)))
+    parts = fit.parts()
+    ends = np.cumsum([len(part.free) for part in parts])
+    regions = [None if region is None else
+               region.take(slice(end - len(part.free), end))
+               for part, end in zip(parts, ends, strict=True)]
+    results = spread_over(_run, parts, regions)
+    state = State.joined([one for one, *_ in results])
     done, spread = (np.concatenate([one[i] for one in results])
                     for i in (1, 2))
     return _Part(state, done, spread,
-                 fit.views.places(state.values, np.arange(n)),
+                 fit.views.places(state.values, np.arange(len(fit.free))),
                  fit.views.pixels, fit.views.slopes, fit.free, enough)
 
 
-def _spread_over(executor, progress_bar, work, pieces):
-    """Return what work makes of all pieces."""
-    results = map_parallel(work, pieces, executor=executor, long=True)
-    return list(progress(results, desc='Fitting stars', total=len(pieces),
+def _spread_over(executor, progress_bar, work, fits, regions):
+    """Return what work makes of all fits and regions."""
+    results = map_parallel(work, fits, regions, executor=executor, long=True)
+    return list(progress(results, desc='Fitting stars', total=len(fits),
                          shown=progress_bar))
 
 
-def _piece(fit, region, rows):
-    views = Views(*(getattr(fit.views, f.name)[rows] for f in fields(Views)))
-    return (None if region is None else region.take(rows), views,
-            fit.boxes[rows], fit.free[rows],
-            None if fit.own is None else fit.own[rows])
-
-
-def _run(joint, piece):
-    """Return the state of a piece, who converged, and the spread."""
-    region, *rest = piece
-    fit = JointFit(joint, *rest, least_gain=_LEAST_GAIN)
+def _run(fit, region):
+    """Return the state of a fit, who converged, and the spread."""
+    fit = replace(fit)  # the pixels it takes out go with it
     state, done = fit.minimize()
     n, m, p = state.values.shape
     spread = np.full((n, p, p), np.nan)
@@ -405,12 +392,10 @@ def _subtract(campaign, state):
     """Return the campaign without the light of all stars, and that light."""
     own = np.concatenate([state.fluxes[..., None], state.pixels], axis=2)
     own[~np.isfinite(own).all(axis=2) | (state.n_pixels == 0)] = 0
-    images = []
+    lights = []
     for k, epoch in enumerate(campaign.epochs):
         there = own[:, k, 0] != 0
         flux, x, y = own[there, k].T
-        light = MixtureRenderer(epoch.model).image(
-            np.stack([x, y, flux]), _FAINTEST, campaign.shapes[k])
-        old = campaign.original[k]
-        images.append(Image(old.data - light, *old[1:]))
-    return campaign.without(images), own
+        lights.append(MixtureRenderer(epoch.model).image(
+            np.stack([x, y, flux]), _FAINTEST, campaign.shapes[k]))
+    return campaign.without(lights), own
