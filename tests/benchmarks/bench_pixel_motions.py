@@ -6,9 +6,9 @@ isolated stars of one signal-to-noise ratio an epoch in seven images at the
 times of Nie et al., frames known, from catalogues (single-epoch photometry of
 what is found at 5 sigma, at least three epochs) and from the pixels, against
 the Cramer-Rao bound by numeric derivatives; ``parallax`` stars of 1 mas in 20
-epochs; ``speed`` many stars, CPU seconds; ``scene`` 614 stars and 590 quasars
-in a field of a few arcminutes, PSFs and frames from the images, what stars
-are found included, errors of motions against magnitude.
+epochs; ``speed`` many stars, CPU seconds and memory; ``scene`` 614 stars and
+590 quasars in a field of a few arcminutes, PSFs and frames from the images,
+what stars are found included, errors of motions against magnitude.
 
 A star counts as measured if it has a motion, no flag, and a significance of
 at least 5 in all images together. RMS and pulls are over all of these, none
@@ -17,6 +17,7 @@ rejected.
 import argparse
 import time
 import warnings
+from pathlib import Path
 
 import astropy.units as u
 import numpy as np
@@ -224,11 +225,27 @@ def print_speed(options):
     sky = Sky(options.speed_side, years, 10.0, np.random.default_rng(1))
     images, stars = sky.images(), sky.known()
     PixelMotionFitter().fit(images, stars[:50])
+    before = memory_from_here()
     start, wall = time.process_time(), time.perf_counter()
     PixelMotionFitter().fit(images, stars)
     print(f'{len(stars)} stars x {len(images)} images of {BOX} x {BOX}: '
           f'{time.process_time() - start:.1f} s CPU, '
-          f'{time.perf_counter() - wall:.1f} s')
+          f'{time.perf_counter() - wall:.1f} s, '
+          f'{peak_memory() - before:.0f} MB beside the images, which have '
+          f'{sum(image.data.nbytes for image in images) / 2**20:.0f} MB')
+
+
+def memory_from_here():
+    """Forget the largest memory so far; return it now [MB]. Linux only."""
+    Path('/proc/self/clear_refs').write_text('5')
+    return peak_memory()
+
+
+def peak_memory():
+    """Return the largest memory since then [MB]."""
+    lines = Path('/proc/self/status').read_text().splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines
+                if line.startswith('VmHWM'))
 
 
 def measured_epoch(scene):

@@ -130,10 +130,9 @@ def test_the_same_numbers_give_the_same_stars_however_they_are_kept(way, rng):
     images = observe(stars, 900, YEARS, rng)
     # Numbers that all kinds can hold.
     plain = [np.rint(image.data) for image in images]
-    tables = []
-    for datas in (plain, [as_kept(data, way) for data in plain]):
-        tables.append(PixelMotionFitter().fit([ImageEpoch(
-            data, PSF, image.wcs, image.year, error=3.0)
-            for data, image in zip(datas, images, strict=True)], stars).stars)
+    tables = [PixelMotionFitter().fit([
+        ImageEpoch(data, PSF, image.wcs, image.year, error=3.0)
+        for data, image in zip(kept, images, strict=True)], stars).stars
+        for kept in (plain, [as_kept(data, way) for data in plain])]
     for name in ('ra', 'pmra', 'pmdec_error', 'flux', 'chi2'):
         assert_array_equal(*(table[name] for table in tables))
