@@ -141,9 +141,9 @@ class CrowdedMixturePhotometry:
         errors. Only used with ``error``.
     saturation : float or `~astropy.units.Quantity`, optional
         The level at which pixels saturate, in the unit of the data. If given,
-        these pixels, the trails of their charge along rows and columns, and a
-        margin of one pixel are masked. Stars with masked centres are fitted to
-        their wings in any case.
+        these pixels and the trails of their charge along rows or columns are
+        masked. Stars with masked centres are fitted to their wings in any
+        case.
     residual_radius : float, optional
         If given, spikes, rings and ghosts of bright stars that the PSF lacks
         are measured on the image, out to this distance [pix] and fading beyond

@@ -116,11 +116,11 @@ class MixturePSFPhotometry(PSFPhotometry):
     saturation : float or `~astropy.units.Quantity`, optional
         The level at which pixels saturate, in the unit of the data and, like
         the data, without the background; infinity if masks or NaN mark
-        saturated pixels. If given, these pixels, the trails of their charge
-        along rows and columns, and a margin of one pixel are left out. Such
-        stars are fitted to their wings, which also give the first position, in
-        as many pixels as needed, and have bit 65536 in ``flags``. Their errors
-        are multiplied by the root of ``reduced_chi2`` if it is above one.
+        saturated pixels. If given, these pixels and the trails of their charge
+        along rows or columns are left out. Such stars are fitted to the
+        others, which also give the first position, in as many pixels as
+        needed, and have bit 65536 in ``flags``. Their errors are multiplied by
+        the root of ``reduced_chi2`` if it is above one.
     residual_radius : float, optional
         If given, spikes, rings and ghosts of bright stars that the PSF lacks
         are measured on the image, out to this distance [pix] and fading beyond

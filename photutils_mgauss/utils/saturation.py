@@ -2,7 +2,12 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import binary_dilation, find_objects, label
+from scipy.ndimage import (
+    binary_dilation,
+    binary_propagation,
+    find_objects,
+    label,
+)
 
 from photutils_mgauss.utils.image import read_level
 from photutils_mgauss.utils.validation import as_real
@@ -11,6 +16,13 @@ from photutils_mgauss.utils.validation import as_real
 # times as bright as those so far beside it.
 _TRAIL_LEVEL, _TRAIL_CONTRAST, _BESIDE = 0.25, 3.0, 3
 _SQUARE = np.ones((3, 3), bool)
+_ALONG = np.ones((3, 1), bool), np.ones((1, 3), bool)
+# A plateau is not flat: next to a full pixel this fraction of the level is
+# full, too.
+_PLATEAU = 0.9
+# Charge runs along an axis if clumps of at least so many rows and columns are
+# so many times longer that way: PSFs may be longer, too, but less.
+_LEAST_SIZE, _LONGER = 3, 1.5
 
 
 def as_saturation(value):
@@ -32,8 +44,11 @@ def saturated_pixels(pixels, level):
     """
     Tell which pixels are of no use near saturated ones.
 
-    Those at the level or above, those that their charge has run into along
-    rows or columns, and a pixel around all of them.
+    Those at the level or above, those next to them that nearly are, and those
+    that their charge has run into along rows or columns, with a pixel beyond
+    both ends of these. Where clumps are too small to say whether and along
+    which of both charge runs, a pixel all around is of no use, too. Other
+    pixels beside saturated ones tell most of where a star is, and are left.
 
     Parameters
     ----------
@@ -55,13 +70,28 @@ def saturated_pixels(pixels, level):
         full = data >= level
     if not full.any():
         return full
-    trails = full.copy()
+    with np.errstate(invalid='ignore'):
+        full = binary_propagation(full, _SQUARE, data >= _PLATEAU * level)
     clumps, _ = label(full, _SQUARE)
+    trails = [full.copy(), full.copy()]
     for box in find_objects(clumps):
-        for turned in (False, True):
-            _mark_trail(*((a.T if turned else a) for a in (data, trails)),
-                        box[::-1] if turned else box, level)
-    return binary_dilation(trails, _SQUARE)
+        _mark_trail(data, trails[0], box, level)
+        _mark_trail(data.T, trails[1].T, box[::-1], level)
+    runs = _axes_of_charge(full, trails[0] | trails[1])
+    if runs is None:
+        return binary_dilation(trails[0] | trails[1], _SQUARE)
+    for axis in np.flatnonzero(runs):
+        # The profile of a star is as steep as that of a trail is beside it.
+        full = full | binary_dilation(trails[axis], _ALONG[axis])
+    return full
+
+
+def _axes_of_charge(*masks):
+    """Return along which axes charge runs, (2,), or None if unknown."""
+    sizes = np.array([[s.stop - s.start for s in box] for mask in masks
+                      for box in find_objects(label(mask, _SQUARE)[0])])
+    sizes = sizes[(sizes >= _LEAST_SIZE).all(axis=1)].sum(axis=0)
+    return sizes > _LONGER * sizes[::-1] if sizes.any() else None
 
 
 def without_saturated(pixels, level):
