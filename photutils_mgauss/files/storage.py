@@ -19,6 +19,7 @@ from photutils_mgauss.files.damage import UnusableFileError, undamaged
 from photutils_mgauss.files.fits_files import name_of, open_fits
 from photutils_mgauss.files.layout import VERSION, check_version, complete
 from photutils_mgauss.files.whole import whole_file
+from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['read_stored', 'storable', 'table_columns']
 
@@ -54,7 +55,8 @@ class _Read(registry.UnifiedReadWrite):
         if isinstance(path, str | PathLike):
             # Says why it cannot be opened, which the registry does not.
             Path(path).open('rb').close()
-        with undamaged(name_of(path), 'an undamaged file of a '
+        with waiting(f'{self._cls.__name__}.read'), undamaged(
+                name_of(path), 'an undamaged file of a '
                        f'{self._cls.__name__} (FITS or ASDF)'):
             return self.registry.read(self._cls, path, *args, **kwargs)
 
@@ -90,7 +92,8 @@ class _Write(registry.UnifiedReadWrite):
 
     def __call__(self, path, *args, **kwargs):
         try:
-            self.registry.write(self._instance, path, *args, **kwargs)
+            with waiting(f'{self._cls.__name__}.write'):
+                self.registry.write(self._instance, path, *args, **kwargs)
         except registry.IORegistryError as error:
             msg = (f'{name_of(path)}: must end with .fits or .asdf, or '
                    "format must be 'fits' or 'asdf'")

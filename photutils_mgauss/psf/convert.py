@@ -24,6 +24,7 @@ class GridConversions:
     """The constructors and conversions of `GriddedMixturePSF`."""
 
     @classmethod
+    @waiting('GriddedMixturePSF.from_file')
     def from_file(cls, path, n_components=None, *, ext=None, detector=None,
                   oversampling=None, grid_shape=(30, 30), **kwargs):
         """

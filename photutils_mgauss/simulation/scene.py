@@ -129,6 +129,7 @@ class Scene:
                       uncertainty=StdDevUncertainty(self.error),
                       wcs=self.wcs, meta=meta)
 
+    @waiting('Scene.write')
     def write(self, path, *, layout='extensions', overwrite=False):
         """
         Write the scene to files, the way a pipeline does.

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable, Table
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 import photutils_mgauss as mg
 from helpers import star_list_files as files
+from photutils_mgauss.files.star_lists import number_rows
 
 KINDS = ('hst1pass', 'dolphot', 'daophot', 'starfinder', 'sextractor')
 
@@ -234,3 +235,16 @@ def test_a_word_in_place_of_a_number_is_shown(tmp_path):
     path = written(tmp_path, 'a.xym', '1 2 3\n4 five 6\n')
     with pytest.raises(ValueError, match=r"numbers in line 2, got 'five'"):
         read(path, 'hst1pass')
+
+
+def test_numbers_are_those_that_python_reads(rng):
+    values = rng.normal(size=(50, 4)) * 10.0**rng.integers(-300, 300, (50, 4))
+    values[3, 1:] = np.nan, np.inf, -np.inf
+    lines = ['', *(' '.join(map(repr, row)) for row in values.tolist()), ' ']
+    assert_array_equal(number_rows(lines, 'list'), values)
+    # What Fortran puts where a number has no room.
+    lines[4] = ' '.join(['****', *map(repr, values[3, 1:].tolist())])
+    values[3, 0] = np.nan
+    assert_array_equal(number_rows(lines, 'list'), values)
+    with pytest.raises(ValueError, match='4 columns in line 9'):
+        number_rows([*lines[:8], '1 2 3'], 'list')

@@ -205,6 +205,24 @@ def test_simulations_show_their_name(monkeypatch, request, call):
     assert named(monkeypatch, call) == [request.node.callspec.id]
 
 
+def test_reading_and_writing_shows_its_name(monkeypatch, tmp_path):
+    path, stars = tmp_path / 'grid.fits', tmp_path / 'stars.als'
+    grid = mg.GriddedMixturePSF([mg.GaussianMixture.from_stddevs(
+        [1], [(0, 0)], [(1, 1)], [0])], [(0, 0)])
+    stars.write_text('NL\n1\n\n1 2.0 3.0 15.0 0.1 9.0 4.0 1.0 0.1\n')
+    scene = mg.simulate(mg.crowded_field((20, 20), rng=1), psf=grid, rng=1,
+                        instrument=mg.Instrument(shape=(20, 20)))
+    for name, call in {
+            'GriddedMixturePSF.write': lambda: grid.write(path),
+            'GriddedMixturePSF.read': lambda: grid.read(path),
+            'GriddedMixturePSF.from_file': lambda: grid.from_file(path),
+            'Table.read of daophot': lambda: QTable.read(
+                stars, format='mgauss.daophot', fwhm=2.0),
+            'Scene.write': lambda: scene.write(tmp_path / 'scene.fits'),
+            }.items():
+        assert named(monkeypatch, call)[0] == name
+
+
 def test_what_is_asked_of_motions_shows_its_name(monkeypatch):
     rng, n = np.random.default_rng(1), 30
     x, y, *motions = rng.uniform(0, 1000, (4, n))
