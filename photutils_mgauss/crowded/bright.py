@@ -1,12 +1,15 @@
 """Bright stars of a tile: saturated ones, and the size of the PSF."""
 import numpy as np
-from scipy.ndimage import find_objects, label
+from scipy.ndimage import distance_transform_edt, find_objects, label
 
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.psf.wings import WINGS, place_behind
 
 # Groups of bad pixels of up to this many may hide a saturated star.
 _SATURATED_PIXELS = (2, 2000)
+# Within this distance of what a saturated star hides [pix], whatever is
+# fainter than this part of it is what the PSF leaves of it.
+_BESIDE, _DOUBTFUL = 2.3, 0.01
 
 
 def saturated_stars(model):
@@ -51,6 +54,29 @@ def _wing_star(model, data, box, clump):
         return None
     return Stars([x], [y], [flux], significance=significance, seeded=True,
                  core=core)
+
+
+def least_fluxes(model):
+    """
+    Return which flux (ny, nx) a new star has at least, 0 for any.
+
+    A companion beside the hidden middle of a star and that star trade light,
+    and both go away from where they are.
+    """
+    clumps, n = label(~model.good, np.ones((3, 3)))
+    s, flux = model.stars, np.zeros(n + 1)
+    x, y = (np.rint(place[s.seeded]).astype(int) for place in (s.x, s.y))
+    ny, nx = model.data.shape
+    inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
+    np.maximum.at(flux, clumps[y[inside], x[inside]],
+                  s.flux[s.seeded][inside])
+    flux[0] = 0
+    if not flux.any():
+        return np.zeros(model.data.shape)
+    distance, nearest = distance_transform_edt(flux[clumps] == 0,
+                                               return_indices=True)
+    return np.where(distance <= _BESIDE,
+                    _DOUBTFUL * flux[clumps[tuple(nearest)]], 0)
 
 
 def size_differences(model):

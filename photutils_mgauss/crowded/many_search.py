@@ -17,6 +17,7 @@ from photutils_mgauss.crowded.search import (
     REACH,
     SEPARATION,
     apart,
+    bright_enough,
     peaks,
     weakest,
 )
@@ -36,13 +37,27 @@ def find(tile, threshold, found_in):
     light[known <= 0] = 0
     y, x, found = peaks(light / np.sqrt(safe), light / safe, threshold,
                         found_in)
-    good = apart(found, tile.stars, tile.rejected)
+    good = apart(found, tile.stars, tile.rejected) & _told(tile, found)
     fluxes = []
     for c, one in zip(tile.job.scales, every, strict=True):
         own = one.information[y, x]
         fluxes.append(np.divide(one.gradient[y, x], own, where=own > 0,
                                 out=c * found.flux)[good])
     tile.admit(found.chosen(good), np.array(fluxes))
+
+
+def _told(tile, found):
+    """Tell which stars are bright enough in an image, if any shows them."""
+    told, seen = np.zeros((2, len(found)), bool)
+    for c, one, least in zip(tile.job.scales, tile.job.maps, tile.least,
+                             strict=True):
+        x, y = one(found.x, found.y)
+        ny, nx = least.shape
+        inside = (x > -0.5) & (x < nx - 0.5) & (y > -0.5) & (y < ny - 0.5)
+        told |= inside & bright_enough(
+            found.replaced(x=x, y=y, flux=c * found.flux), least)
+        seen |= inside
+    return told | ~seen
 
 
 def _evidence(tile, threshold):

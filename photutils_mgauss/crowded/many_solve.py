@@ -2,7 +2,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from photutils_mgauss.crowded.bright import saturated_stars
+from photutils_mgauss.crowded.bright import least_fluxes, saturated_stars
 from photutils_mgauss.crowded.given import WARM_UP, associate
 from photutils_mgauss.crowded.many_search import find, leave_out
 from photutils_mgauss.crowded.many_tile import ManyTile
@@ -34,6 +34,7 @@ def solve_many(job):
             tile.step(damping)
     else:
         tile.start(*_saturated(tile))
+        tile.note_least(least_fluxes)
         find_all(tile, find, leave_out)
         if job.given is not None:
             associate(tile, job.given, leave_out)

@@ -150,8 +150,8 @@ class ManyTile(Searched):
         the standard deviation.
     measured : (E, n) `~numpy.ndarray`
         Fluxes of all images, each free.
-    widths, moved
-        As of `Tile`; ``widths`` are those of each image.
+    widths, moved, least
+        As of `Tile`; ``widths`` and ``least`` are those of each image.
     """
 
     def __init__(self, job):
@@ -164,6 +164,7 @@ class ManyTile(Searched):
         self.phases = [phases(part.psf, part.data.shape)
                        for part in job.parts]
         self.widths = [np.empty(0)] * len(job.parts)
+        self.least = [np.zeros(model.data.shape) for model in self.models]
         self.moved = np.empty(0)
         far = FARTHEST / reach_of(job.factors)[2:]
         self.usual = np.stack([np.zeros(far.shape), far])
@@ -412,6 +413,10 @@ class ManyTile(Searched):
             step = _step(np.where(restless[k], light[k], 0), shift)
             model.take_in_place(step, levels[k], np.flatnonzero(restless[k]))
         self._form_equations()
+
+    def note_least(self, measure):
+        """Remember which flux a new star has at least in each image."""
+        self.least = [measure(model) for model in self.models]
 
     def note_widths(self, measure):
         """Remember by how much each image's PSF is too narrow."""

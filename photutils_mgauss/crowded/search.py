@@ -26,7 +26,9 @@ def find(tile, threshold, found_in):
     """Add the maxima of significance on the residual."""
     significance, flux = _scores(tile, threshold)
     found = peaks(significance, flux, threshold, found_in)[2]
-    tile.admit(found.chosen(apart(found, tile.model.stars, tile.rejected)))
+    good = apart(found, tile.model.stars, tile.rejected)
+    good &= bright_enough(found, tile.least)
+    tile.admit(found.chosen(good))
 
 
 def peaks(significance, flux, threshold, found_in):
@@ -68,6 +70,14 @@ def apart(found, known, rejected):
         if len(places) and len(found):
             out &= cKDTree(places).query(positions)[0] > limit
     return out
+
+
+def bright_enough(found, least):
+    """Tell which stars have the flux that they are to have where they are."""
+    ny, nx = least.shape
+    x = np.clip(np.rint(found.x).astype(int), 0, nx - 1)
+    y = np.clip(np.rint(found.y).astype(int), 0, ny - 1)
+    return found.flux >= least[y, x]
 
 
 def leave_out(tile, threshold):

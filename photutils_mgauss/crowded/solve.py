@@ -1,5 +1,9 @@
 """The stars of a tile found and fitted, from first to last."""
-from photutils_mgauss.crowded.bright import saturated_stars, size_differences
+from photutils_mgauss.crowded.bright import (
+    least_fluxes,
+    saturated_stars,
+    size_differences,
+)
 from photutils_mgauss.crowded.given import associate, warm_up
 from photutils_mgauss.crowded.search import find, leave_out
 from photutils_mgauss.crowded.tile import Tile
@@ -28,6 +32,7 @@ def solve_tile(job):
         warm_up(tile, job.given)
     else:
         tile.start(saturated_stars(tile.model))
+        tile.note_least(least_fluxes)
         find_all(tile, find, leave_out)
         if job.given is not None:
             associate(tile, job.given, leave_out)

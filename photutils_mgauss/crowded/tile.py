@@ -117,6 +117,8 @@ class Tile(Searched):
         By how much the PSF is too narrow at bright stars.
     moved : (n,) `~numpy.ndarray`
         How far each star went in the last step [pix].
+    least : (ny, nx) `~numpy.ndarray`
+        Which flux a new star has at least.
     """
 
     def __init__(self, job):
@@ -126,6 +128,7 @@ class Tile(Searched):
         self.origin = job.origin
         self.widths = np.empty(0)
         self.moved = np.empty(0)
+        self.least = np.zeros(job.data.shape)
         self.templates = _templates(job.psf, job.data.shape)
 
     @property
@@ -233,6 +236,10 @@ class Tile(Searched):
         """Find the diffuse light again."""
         self.model.update_diffuse()
         self._form_equations()
+
+    def note_least(self, measure):
+        """Remember which flux a new star has at least, as measured."""
+        self.least = measure(self.model)
 
     def note_widths(self, measure):
         """Remember by how much the PSF is too narrow, as measured."""
