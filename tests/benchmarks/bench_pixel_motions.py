@@ -6,9 +6,13 @@ isolated stars of one signal-to-noise ratio an epoch in seven images at the
 times of Nie et al., frames known, from catalogues (single-epoch photometry of
 what is found at 5 sigma, at least three epochs) and from the pixels, against
 the Cramer-Rao bound by numeric derivatives; ``parallax`` stars of 1 mas in 20
-epochs; ``speed`` many stars, CPU seconds and memory; ``scene`` 614 stars and
-590 quasars in a field of a few arcminutes, PSFs and frames from the images,
-what stars are found included, errors of motions against magnitude.
+epochs; ``limit`` the same stars, whose errors are compared with those of the
+mean of the posterior probability for known fluxes and a flat prior, integrated
+over motions and places by sampling: no estimator that treats all places and
+motions alike has a smaller mean square error; ``speed`` many stars, CPU
+seconds and memory; ``scene`` 614 stars and 590 quasars in a field of a few
+arcminutes, PSFs and frames from the images, what stars are found included,
+errors of motions against magnitude.
 
 A star counts as measured if it has a motion, no flag, and a significance of
 at least 5 in all images together. RMS and pulls are over all of these, none
@@ -26,6 +30,9 @@ from astropy.stats import mad_std
 from astropy.table import QTable
 from astropy.wcs import WCS
 from photutils.detection import DAOStarFinder
+from scipy.ndimage import map_coordinates, spline_filter
+from scipy.special import ndtri
+from scipy.stats import qmc
 
 from photutils_mgauss import (
     Epoch,
@@ -220,6 +227,84 @@ def print_parallax(options):
               '{:.3f} mas'.format(signal, *values, mean), flush=True)
 
 
+class Best:
+    """
+    Means of the posterior of motions for known fluxes and a flat prior.
+
+    Products of the PSF with the data are looked up in maps of the places
+    around each star; ``n_points`` points are drawn from a Gaussian that is
+    wider than the errors are.
+    """
+
+    step, reach, wide, n_points = 0.08, 2.4, 2.0, 4096
+
+    def __init__(self, sky, images):
+        self.sky, self.images = sky, images
+        axis = np.arange(-self.reach, self.reach + self.step / 2, self.step)
+        stamps = np.array([[MIXTURE.render((BOX, BOX), BOX // 2 + x,
+                                           BOX // 2 + y).ravel()
+                            for x in axis] for y in axis])
+        # Without a mean they do not see the sky.
+        self.stamps = stamps - stamps.mean(axis=-1, keepdims=True)
+        points = ndtri(qmc.Sobol(4, rng=np.random.default_rng(3)).random(
+            self.n_points))
+        self.drawn = 0.5 * np.sum(points**2, axis=1)
+        self.away = self.wide * points * sky.bound()
+
+    def errors(self):
+        """Return the errors of motions (2, n) [mas / yr]."""
+        total = np.broadcast_to(self.drawn, (len(self.sky.start),
+                                             self.n_points)).copy()
+        squares = spline_filter(np.sum(self.stamps**2, axis=-1))
+        for k, image in enumerate(self.images):
+            x, y = self.sky.wcs[k].world_to_pixel(self.sky.places(k))
+            to_pixels = np.linalg.inv(self.sky.wcs[k].wcs.cd * 3.6e6)
+            dt = self.sky.years[k] - self.sky.mean
+            moved = (self.away[:, :2] + self.away[:, 2:] * dt) @ to_pixels.T
+            for star, place in enumerate(zip(x, y, strict=True)):
+                total[star] += self._chances(image, place, moved, squares)
+        weight = np.exp(total - total.max(axis=1, keepdims=True))
+        return (weight @ self.away[:, 2:] / weight.sum(axis=1)[:, None]).T
+
+    def _chances(self, image, place, moved, squares):
+        """Return the logarithm of the likelihood at places around one."""
+        i, j = (int(np.rint(one)) for one in place)
+        half = BOX // 2
+        box = image.data[j - half:j + half + 1, i - half:i + half + 1]
+        light = spline_filter(self.stamps @ box.ravel())
+        at = [(moved[:, a] + place[a] - (i, j)[a] + self.reach) / self.step
+              for a in (1, 0)]
+        n, m = (map_coordinates(one, at, prefilter=False, mode='nearest')
+                for one in (light, squares))
+        flux = self.sky.flux
+        return (flux * n - flux**2 * m / 2) / NOISE**2
+
+
+def print_limit(options):
+    years = [exposure.time.jyear for exposure in paper_exposures()]
+    for signal in options.signals:
+        squares = []
+        for seed in range(options.seed, options.seed + options.repeats):
+            sky = Sky(options.side, years, signal,
+                      np.random.default_rng([seed, int(10 * signal)]))
+            images = sky.images()
+            stars, measured = from_pixels(sky, images)
+            pixels = np.array([stars[name].value for name in (
+                'pmra', 'pmdec')]) - sky.motion
+            squares.append(np.stack([pixels, Best(sky, images).errors()])[
+                ..., measured]**2 / sky.bound()[2:4, None]**2)
+        squares = np.concatenate(squares, axis=-1).reshape(2, -1)
+        rms = np.sqrt(squares.mean(axis=1))
+        error = squares.std(axis=1) / np.sqrt(squares.shape[1]) / 2 / rms
+        parts = squares / squares.mean(axis=1, keepdims=True)
+        ratio = rms[0] / rms[1]
+        unsure = ratio * np.std(parts[0] - parts[1]) / np.sqrt(
+            squares.shape[1]) / 2
+        print(f'limit, S/N {signal:4.1f}: pixels {rms[0]:.3f} +- '
+              f'{error[0]:.3f} of the bound, posterior for known fluxes '
+              f'{rms[1]:.3f}, ratio {ratio:.4f} +- {unsure:.4f}', flush=True)
+
+
 def print_speed(options):
     years = [exposure.time.jyear for exposure in paper_exposures()]
     sky = Sky(options.speed_side, years, 10.0, np.random.default_rng(1))
@@ -336,6 +421,8 @@ def main():
     parser.add_argument('parts', nargs='*',
                         default=['table', 'parallax', 'speed'])
     parser.add_argument('--side', type=int, default=30)
+    parser.add_argument('--repeats', type=int, default=1,
+                        help='seeds of the limit')
     parser.add_argument('--speed-side', type=int, default=100)
     parser.add_argument('--field', type=float, default=2.4,
                         help='side of the scene [arcmin]')
@@ -346,7 +433,8 @@ def main():
     warnings.simplefilter('ignore')
     for part in options.parts:
         {'table': print_table, 'parallax': print_parallax,
-         'speed': print_speed, 'scene': print_scene}[part](options)
+         'limit': print_limit, 'speed': print_speed,
+         'scene': print_scene}[part](options)
 
 
 if __name__ == '__main__':
