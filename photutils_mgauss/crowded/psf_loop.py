@@ -23,8 +23,10 @@ from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.utils.image import with_unit
 from photutils_mgauss.utils.waiting import progress
 
-# The significance of the faintest stars of each pass; the last goes on.
-_THRESHOLDS = (40.0, 30.0, 20.0, 15.0, 12.0)
+# The significance of the faintest stars of each pass; the last goes on. It is
+# near that of photometry: where stars are dense, those not found would be
+# taken for wings of the PSF.
+_THRESHOLDS = (40.0, 25.0, 15.0, 10.0, 6.0)
 # The radius of the stamps of the first passes [pix], while there are still
 # many faint stars in the wings.
 _RADII = (8.0, 12.0)
@@ -229,11 +231,11 @@ def fit_field(pixels, options, solve, effective_gain=None):
                                             solve)
             change = difference(field, last)
             _advance(bar, field, change)
-            if options.is_last_kind(
-                    number, field.degree, len(field.stars)) and (
-                        change < _REST or change > _STALL * before):
-                break
-            before = change
+            # A pass that goes deeper may change more than the one before.
+            if options.is_last_kind(number, field.degree, len(field.stars)):
+                if change < _REST or change > _STALL * before:
+                    break
+                before = change
         else:
             warnings.warn(
                 f'the PSF still changes by {change:.2%} from pass to pass '

@@ -12,12 +12,15 @@ from scipy.spatial import cKDTree
 
 from photutils_mgauss import (
     CrowdedMixturePhotometry,
+    GaussianMixture,
+    GriddedMixturePSF,
     Instrument,
     MixtureField,
     crowded_field,
     csst_psf,
     fit_crowded_psf,
     inject_and_recover,
+    render_stars,
     simulate,
 )
 from photutils_mgauss.crowded import psf_loop
@@ -210,3 +213,28 @@ def test_an_image_without_stars_is_said():
     with pytest.raises(ValueError, match='data must have pixels'), (
             pytest.warns(AstropyUserWarning, match='no pixel')):
         fit_crowded_psf(data, error=10.0, mask=np.ones((100, 100), bool))
+
+
+def test_faint_stars_of_a_dense_field_are_no_wings_of_the_psf():
+    # One star in 27 pixels, all of them above ten times the noise.
+    n, rng = 100, np.random.default_rng(5)
+    psf = GaussianMixture.from_stddevs(
+        [0.75, 0.23, 0.02], np.zeros((3, 2)), [(.95, .95), (1.6, 1.6), (4, 4)])
+    x, y = rng.uniform(-5, n + 5, (2, 450))
+    flux = np.minimum(300 * (rng.pareto(1.1, x.size) + 1), 3e5)
+    light = render_stars(GriddedMixturePSF([psf], [(50, 50)]), x, y, flux,
+                         (n, n)) + 50
+    error = np.sqrt(light + 9)
+    found = fit_crowded_psf(rng.normal(light, error), error=error,
+                            n_components=3, degree=0, radius=12)
+    for radius in (5, 8, 10):
+        assert_allclose(found.mixture_at(50, 50).encircled_energy(radius),
+                        psf.encircled_energy(radius), atol=0.01)
+
+
+def test_a_deeper_pass_does_not_end_the_loop(monkeypatch):
+    # Its change says nothing of how the one before it converged.
+    changes = iter([0.1, 0.01, 0.01, 0.01, 0.2, 0.1, 0.05, 0.04])
+    monkeypatch.setattr(psf_loop, 'difference', lambda *_: next(changes))
+    fit_crowded_psf(**corner(), **QUICK)
+    assert next(changes, None) is None
