@@ -90,6 +90,7 @@ __getattr__, __dir__, __all__ = hand_on(__name__, {
     'GroupMoments': 'groups',
     'GroupPixels': 'groups',
     'group_moments': 'groups',
+    'star_scores': 'groups',
     'weigh_groups': 'groups',
     'DEPTH': 'image',
     'bleed': 'image',

@@ -3,7 +3,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from photutils_mgauss.kernels.jit import inner, kernel
+from photutils_mgauss.kernels.jit import apart, inner, kernel
 from photutils_mgauss.kernels.star_normal import (
     Pixels,
     find_reach,
@@ -201,3 +201,48 @@ def group_moments(pixels, rows, places, psf, fit_sky, image, parameters,
         if fit_sky:
             out.squares[g, image] -= _put_sky(new, m, products, data,
                                               out.sky[g, image])
+
+
+@apart
+def _add_score(profile, data, weights, fit_sky, light, weight, at):
+    """Add products of a PSF with data and itself at one place of both."""
+    own = 0.0
+    seen = 0.0
+    cross = 0.0
+    sky = 0.0
+    total = 0.0
+    for k in range(weights.size):
+        w = weights[k]
+        own += w * profile[k] * profile[k]
+        seen += w * profile[k] * data[k]
+        cross += w * profile[k]
+        sky += w * data[k]
+        total += w
+    if fit_sky and total > 0:
+        own -= cross * cross / total
+        seen -= cross * sky / total
+    light[at] += seen
+    weight[at] += own
+
+
+@kernel
+def star_scores(pixels, rows, places, psf, fit_sky, number, scratch, light,
+                weight):
+    """
+    Add what `group_moments` finds of the PSF alone, for groups of one star.
+
+    The products with the data and with itself go into column number of light
+    and weight (g, c). scratch is a Scratch.
+    """
+    derivatives = scratch.derivatives[0]
+    for g in range(rows.size):
+        r = rows[g]
+        if pixels.n_pixels[r] == 0:
+            continue
+        box = pixels.boxes[r, 0]
+        used = box[2] * box[3]
+        fill_derivatives(places[g, 0, 0], places[g, 0, 1], box, psf,
+                         scratch.tiling, derivatives)
+        _add_score(derivatives[0], pixels.data[r, 0, :used],
+                   pixels.weights[r, 0, :used], fit_sky, light[g], weight[g],
+                   number)

@@ -141,12 +141,12 @@ class Moments:
     sky: np.ndarray
 
     @classmethod
-    def of(cls, joint, pixels, rows, places):
+    def of(cls, joint, pixels, rows, places, scratch):
         """
         Return those of some groups (r,) at places (r, E, m, 2).
 
         ``pixels`` are the `~photutils_mgauss.kernels.GroupPixels` of all
-        groups in each image.
+        groups in each image, ``scratch`` the memory to work in.
         """
         n, n_images, m = places.shape[:3]
         size = 3 * m
@@ -159,8 +159,7 @@ class Moments:
         for k, image in enumerate(pixels):
             kernels.group_moments(
                 image, rows, np.ascontiguousarray(places[:, k]),
-                joint.psfs[k], joint.fit_sky, k, np.zeros(size + 1),
-                kernels.BoxScratch.empty(m, image.boxes.reshape(-1, 4)),
+                joint.psfs[k], joint.fit_sky, k, np.zeros(size + 1), scratch,
                 arrays)
         return out
 
@@ -266,6 +265,12 @@ class JointFit:
             None if self.own is None else np.ascontiguousarray(
                 self.own[:, k])) for k in range(self.boxes.shape[1])]
 
+    @cached_property
+    def _scratch(self):
+        """The `~photutils_mgauss.kernels.BoxScratch` of all images."""
+        return kernels.BoxScratch.empty(self.boxes.shape[2],
+                                        self.boxes.reshape(-1, 4))
+
     def evaluate(self, values, rows):
         """Return the `State` of some groups (r,) at values (r, m, p)."""
         return _state(self.joint, values, self.views.slopes[rows],
@@ -273,10 +278,14 @@ class JointFit:
 
     def _moments(self, values, rows):
         """Return the `Moments` of some groups (r,) at values (r, m, p)."""
+        return Moments.of(self.joint, self._pixels, rows,
+                          self._places(values, rows), self._scratch)
+
+    def _places(self, values, rows):
+        """Return the pixels (r, E, m, 2) at values, 0 where there are none."""
         places = self.views.places(values, rows)
         seen = self.boxes[rows][..., 2:].all(axis=-1)
-        return Moments.of(self.joint, self._pixels, rows,
-                          np.where(seen[..., None], places, 0.0))
+        return np.where(seen[..., None], places, 0.0)
 
     def minimize(self):
         """Return the `State` at the least chi2, and who converged (g,)."""
@@ -320,11 +329,13 @@ class JointFit:
 
         Only for single stars; (r, C) each.
         """
-        moments = self._moments(values, rows)
+        places = self._places(values, rows)
         light, weight = np.zeros((2, len(rows), self.joint.n_fluxes))
         for k, c in enumerate(self.joint.shared):
-            light[:, c] += moments.data[:, k, 0]
-            weight[:, c] += moments.products[:, k, 0, 0]
+            kernels.star_scores(
+                self._pixels[k], rows, np.ascontiguousarray(places[:, k]),
+                self.joint.psfs[k], self.joint.fit_sky, c,
+                self._scratch.around, light, weight)
         return light, weight
 
 

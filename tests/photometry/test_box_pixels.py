@@ -11,7 +11,9 @@ from helpers.star_images import MIXTURE, PSF
 from photutils_mgauss import ImageEpoch, PixelMotionFitter
 from photutils_mgauss.photometry.box_pixels import ScaledImage
 from photutils_mgauss.photometry.engine import cut_boxes, psf_arrays
+from photutils_mgauss.photometry.joint_pixels import JointFit, boxes_around
 from photutils_mgauss.pixel_motions.campaign import read_campaign
+from photutils_mgauss.pixel_motions.stars import read_stars
 from photutils_mgauss.utils.image import PixelData
 
 YEARS = 2024.5, 2028.0
@@ -136,3 +138,29 @@ def test_the_same_numbers_give_the_same_stars_however_they_are_kept(way, rng):
         for kept in (plain, [as_kept(data, way) for data in plain])]
     for name in ('ra', 'pmra', 'pmdec_error', 'flux', 'chi2'):
         assert_array_equal(*(table[name] for table in tables))
+
+
+@pytest.mark.parametrize('fit_sky', [True, False])
+@pytest.mark.parametrize('flux', ['image', 'common'])
+def test_scores_are_those_of_the_whole_equations(fit_sky, flux, rng):
+    stars = truth([20, 40, 57, -30], [20, 40, 3, 5])
+    campaign = read_campaign(observe(stars, 200, YEARS, rng), flux=flux,
+                             fit_sky=fit_sky, parallax=False,
+                             acceleration=False)
+    values = read_stars(stars, campaign).values[:, None]
+    views = campaign.views(values)
+    fit = JointFit(campaign.joint, views, boxes_around(
+        views.pixels, (9, 11), campaign.shapes), np.ones((4, 1, 4), bool))
+    rows = np.array([3, 2, 0])
+    moved = values[rows] + rng.normal(0, 20, (3, 1, 4))
+    state, shared = fit.evaluate(moved, rows), campaign.joint.shared
+    each = state.weights[..., 0]
+    light = state.excess[..., 0] + each * state.fluxes[:, shared, 0]
+    got = fit.scores(moved, rows)
+    for c in range(shared.max() + 1):
+        for found, whole in zip(got, (light, each), strict=True):
+            assert_allclose(found[:, c], whole[:, shared == c].sum(axis=1),
+                            rtol=1e-10)
+    # The last star is in none of the images.
+    assert not got[1][0].any()
+    assert (got[1][1:] > 0).all()
