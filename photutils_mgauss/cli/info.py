@@ -1,8 +1,8 @@
 """``mgauss info``: what a file is, and how it would be read."""
-from pathlib import Path
 
 from photutils_mgauss.cli import tools
 from photutils_mgauss.cli.motions import is_table
+from photutils_mgauss.cli.running import complain
 
 # What names of columns mean to the other commands.
 _COLUMNS = {
@@ -38,12 +38,23 @@ def add(commands):
 
 
 def run(options):
-    """Say what the files are."""
-    tools.check_inputs(options.inputs)
-    read = tools.read_images(options, options.inputs)
-    for i, path in enumerate(map(Path, options.inputs)):
-        with tools.about(path):
-            tools.say(options, *_lines(options, path, lambda i=i: read(i)))
+    """Say what the files are; those that are none of them do not end it."""
+    paths = tools.files_in(options.inputs)
+    read = tools.read_images(options, paths)
+    wrong = None
+    for i, path in enumerate(paths):
+        try:
+            tools.check_inputs([path])
+            with tools.about(path):
+                lines = _lines(options, path, lambda i=i: read(i))
+        except Exception as error:  # noqa: BLE001 readers raise what they please
+            if wrong is not None:
+                complain(tools.sentence_of(wrong))
+            wrong = error
+        else:
+            tools.say(options, *lines)
+    if wrong is not None:
+        raise wrong
 
 
 def _lines(options, path, read):
@@ -56,6 +67,7 @@ def _lines(options, path, read):
     lines = [f'{path}: {_KINDS[kind]}']
     if kind == 'mixtures':
         return lines + _of_grid(path)
+    lines += _of_other_psf(kind, path)
     lines.append('  mgauss psf makes mixtures of it; photometry does so each '
                  'time')
     return lines
@@ -79,6 +91,23 @@ def _of_grid(path):
     width = (f'  FWHM {np.nanmin(fwhm):.2f} to {np.nanmax(fwhm):.2f} pix; '
              f'{kind}')
     return [nodes, width, *_of_record(psf_record(path))]
+
+
+def _of_other_psf(kind, path):
+    """Return what is in a PSF file that can be read at once."""
+    if kind != 'psfex':
+        return []
+    from photutils_mgauss.files.psfex import read_psfex
+    models = read_psfex(path, ext='all')
+    return [f'  extension {ext}: {_of_psfex(model)}'
+            for ext, model in models.items()]
+
+
+def _of_psfex(model):
+    n, ny, nx = model.planes.shape
+    variables = ' and '.join(model.contexts) or 'nothing'
+    return (f'{nx} x {ny} samples of {model.sampling:g} pix, {n} terms of a '
+            f'polynomial of {variables}')
 
 
 def _of_record(record):

@@ -59,7 +59,7 @@ def add_measuring(parser):
     group.add_argument('--threshold', type=tools.positive, metavar='SIGMA',
                        help='significance of the faintest stars (default: 5, '
                             'or 4.5 with --crowded)')
-    group.add_argument('--fit-shape', type=tools.count, default=11,
+    group.add_argument('--fit-shape', type=tools.odd, default=11,
                        metavar='PIXELS', help='side of the fitted region, '
                        'odd (default: %(default)s)')
     group.add_argument('--residual-radius', type=tools.positive,

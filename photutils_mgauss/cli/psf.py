@@ -48,7 +48,7 @@ def add(commands):
 def add_fit(parser):
     """Add the options of the fit to an image's own stars; return them."""
     group = parser.add_argument_group('the fit')
-    group.add_argument('--n-components', type=tools.number_or_auto,
+    group.add_argument('--n-components', type=tools.count_or_auto,
                        metavar='K', help='number of Gaussians, or auto to '
                        'choose it (default: 6 for images, auto with 8 to 59 '
                        'stars; 3 for PSF files)')
@@ -57,6 +57,10 @@ def add_fit(parser):
                             'auto (default: 4, auto with 8 to 59 stars)')
     group.add_argument('--radius', type=tools.positive, metavar='PIXELS',
                        help='radius of the stamps (default: 10 for images)')
+    group.add_argument('--pixel-integrated', action='store_true',
+                       default=None, help='describe the optics alone, '
+                       'integrated over pixels (default: if stars are '
+                       'narrower than 1.6 pixels)')
     group.add_argument('--min-snr', type=tools.positive, default=50,
                        metavar='SNR', help='smallest signal-to-noise ratio '
                        'of the stars (default: %(default)s)')

@@ -22,7 +22,8 @@ def fit_options(options):
     """Return the options of `fit_mixture_field` that are given."""
     from photutils_mgauss.cli.psf_files import read_psf
     given = {name: getattr(options, name)
-             for name in ('n_components', 'degree', 'radius')}
+             for name in ('n_components', 'degree', 'radius',
+                          'pixel_integrated')}
     if options.start is not None:
         with tools.about(options.start):
             given['start'] = read_psf(options.start)

@@ -49,7 +49,8 @@ def run(options):
                                        [path for path, _ in paths])
         step('draw figures')
         _write(options, sections, output)
-    tools.say(options, f'{output}: {len(sections)} results')
+    number = f'{len(sections)} result{"s" * (len(sections) > 1)}'
+    tools.say(options, f'{output}: {number}')
 
 
 def _write(options, sections, output):
@@ -63,12 +64,9 @@ def _files(inputs):
     """Return (path, whether it was named itself) of all files."""
     found = []
     for path in map(Path, inputs):
-        if path.is_dir():
-            found += [(file, False) for file in sorted(path.iterdir())
-                      if file.is_file() and not file.name.startswith('.')]
-        else:
+        if not path.is_dir():
             tools.check_inputs([path])
-            found.append((path, True))
+        found += [(file, not path.is_dir()) for file in tools.files_in([path])]
     return found
 
 

@@ -48,7 +48,7 @@ def run_command(options, words, *, is_process):
             with _log_file(options.log_file, words):
                 return _run(options, is_process)
         except OSError as error:
-            _complain(tools.sentence_of(error))
+            complain(tools.sentence_of(error))
             return 1
 
 
@@ -89,14 +89,14 @@ def _run(options, is_process):
     try:
         (_run_apart if is_process else options.run)(options)
     except _TerminatedError:
-        _complain('terminated')
+        complain('terminated')
         return _TERMINATED
     except KeyboardInterrupt:
-        _complain('interrupted')
+        complain('interrupted')
         return _INTERRUPTED
     except Exception as error:  # noqa: BLE001 nobody above has words for it
         tools.LOG.debug('what went wrong:', exc_info=error)
-        _complain(tools.sentence_of(error))
+        complain(tools.sentence_of(error))
         return 1
     return 0
 
@@ -126,7 +126,7 @@ def _leave(error):
     terminated = isinstance(error, _TerminatedError)
     # Asking twice does not help.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _complain('terminated' if terminated else 'interrupted')
+    complain('terminated' if terminated else 'interrupted')
     with suppress(OSError):
         sys.stdout.flush()
     sys.stderr.flush()
@@ -152,7 +152,8 @@ def _log_file(path, words):
         handler.close()
 
 
-def _complain(words):
+def complain(words):
+    """Say what went wrong, as the last line of a command does."""
     tools.LOG.error('%s', words)
     tqdm.write(f'mgauss: {words}', file=sys.stderr)
 

@@ -18,6 +18,9 @@ _SHOWN = 12
 _TICKS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 1000)
 # A median of reduced chi2 or uwe in this range says that errors are right.
 _RIGHT = (0.8, 1.25)
+# The error of a PSF, as a share of the light in a pixel, that photometry of
+# crowded fields expects if nothing else is said.
+_ACCURATE = 0.01
 # More detections than this share are not rejected if all is well.
 _MANY = 0.1
 # Detections on a chip that a map of residuals takes.
@@ -53,14 +56,20 @@ def psf_section(path):
 
 
 def _psf_verdict(fwhm, record):
-    """Judge a PSF by the number of its stars, if it was made of stars."""
+    """Judge a PSF that was made of stars by their number and its misfit."""
     words = f'FWHM {np.median(fwhm):.2f} pix, {np.ptp(fwhm):.2f} pix of range'
     stars, degree = record.get('n_stars'), record.get('degree')
     if stars is None or degree is None:
         return Verdict(True, words)
     terms = (degree + 1) * (degree + 2) // 2
-    return Verdict(stars >= 2 * terms, f'{words}; made of {stars} stars for '
-                   f'the {terms} terms of a polynomial of degree {degree}')
+    words = (f'{words}; made of {stars} stars for the {terms} terms of a '
+             f'polynomial of degree {degree}')
+    error = record.get('accuracy') or 0
+    if error > _ACCURATE:
+        words = (f'{words}; it misses {error:.1%} of the light in a pixel, so '
+                 'bright stars are measured worse than their noise allows: '
+                 'more stars or Gaussians may help')
+    return Verdict(stars >= 2 * terms and error <= _ACCURATE, words)
 
 
 def _maps(psf, stars):

@@ -16,8 +16,8 @@ _OWN = ('output', 'overwrite', 'quiet', 'log_file', 'checkpoint', 'dry_run',
 _ONE_IMAGE = ('error', 'weight', 'flags', 'wcs', 'time', 'detector', 'frames')
 # Options of mgauss motions that are for images to be measured first, which
 # here is the work of other commands.
-_MEASURING = {'psf': ('n_components', 'degree', 'radius', 'min_snr',
-                      'max_stars', 'stars', 'start'),
+_MEASURING = {'psf': ('n_components', 'degree', 'radius', 'pixel_integrated',
+                      'min_snr', 'max_stars', 'stars', 'start'),
               'photometry': ('crowded', 'threshold', 'magnitudes', 'psf')}
 _PIXELS_ONLY = ('targets', 'forced', 'refine_frames', 'fit_shape')
 _SHARED = ('parallax', 'observer')

@@ -132,11 +132,23 @@ def not_negative(text):
     return _whole_number(text, 0)
 
 
+def odd(text):
+    """Return an odd whole number, for argparse."""
+    value = count(text)
+    if value % 2 == 0:
+        msg = f'must be odd, got {text}'
+        raise argparse.ArgumentTypeError(msg)
+    return value
+
+
+def count_or_auto(text):
+    """Return a whole number from 1 or 'auto', for argparse."""
+    return text if text == 'auto' else _whole_number(text, 1, ' or auto')
+
+
 def number_or_auto(text):
-    """Return a whole number or 'auto', for argparse."""
-    if text == 'auto':
-        return text
-    return _whole_number(text, 0, ' or auto')
+    """Return a whole number from 0 or 'auto', for argparse."""
+    return text if text == 'auto' else _whole_number(text, 0, ' or auto')
 
 
 def transform(text):
@@ -231,6 +243,18 @@ def check_inputs(paths):
         if Path(path).is_dir():
             msg = f'{path}: must be a file, but is a folder'
             raise IsADirectoryError(msg)
+
+
+def files_in(inputs):
+    """Return the files that are given, and those of folders given."""
+    found = []
+    for path in map(Path, inputs):
+        if path.is_dir():
+            found += [file for file in sorted(path.iterdir())
+                      if file.is_file() and not file.name.startswith('.')]
+        else:
+            found.append(path)
+    return found
 
 
 def check_different(paths):

@@ -1,9 +1,8 @@
 r"""
 Crowded fields: all stars of an image found and fitted together.
 
-Every star is fitted with its neighbours free, in an image of which all other
-stars are subtracted, as Sec. 5 of Nie et al. asks of a method for the
-Galactic bulge.
+Every star is fitted with its neighbours free, all other stars subtracted, as
+Sec. 5 of Nie et al. asks of a method for the Galactic bulge.
 """
 import numpy as np
 
@@ -17,11 +16,13 @@ from photutils_mgauss.crowded.solved import Solved
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.crowded.table import positions
 from photutils_mgauss.crowded.tile import TileOptions
+from photutils_mgauss.photometry.engine import as_model
+from photutils_mgauss.photometry.flags import decode_psf_flags
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.psf.star_errors import add_psf_errors
 from photutils_mgauss.utils.checkpoint import Checkpoint
-from photutils_mgauss.utils.flags import REPEATED, decode
+from photutils_mgauss.utils.flags import REPEATED
 from photutils_mgauss.utils.image import read_pixels, with_unit
 from photutils_mgauss.utils.per_thread import PerThread, keep
 from photutils_mgauss.utils.saturation import as_saturation, without_saturated
@@ -36,7 +37,6 @@ _FAINTEST = 1e-3
 # Stars are looked for again if correlated noise makes the variance of fluxes
 # larger than this.
 _LITTLE = 1.1
-
 
 # What replaces keywords of photutils' classes.
 _INSTEAD = {
@@ -77,9 +77,9 @@ class CrowdedMixturePhotometry:
 
     Parameters
     ----------
-    psf_model : GriddedMixturePSF, MultiGaussianPSFModel or None
-        The PSF. With None, `fit_crowded_psf` makes the PSF of each image from
-        its own stars.
+    psf_model : GriddedMixturePSF, MultiGaussianPSFModel, MixtureField or None
+        The PSF; a field is put on a grid. With None, `fit_crowded_psf` makes
+        the PSF of each image from its own stars.
     threshold : float, optional
         The smallest significance for adding a star, in standard errors of its
         flux.
@@ -236,7 +236,7 @@ class CrowdedMixturePhotometry:
                  saturation=None, residual_radius=None, **elsewhere):
         if elsewhere:
             raise TypeError(_instead_of(next(iter(elsewhere))))
-        self.psf_model = psf_model
+        self.psf_model = psf_model = as_model(psf_model)
         self.threshold = as_real(threshold, 'threshold', above=0)
         self.keep = as_real(keep, 'keep', minimum=0)
         self.depth = as_real(depth, 'depth', above=0)
@@ -525,8 +525,8 @@ class CrowdedMixturePhotometry:
         ValueError
             If there is no table yet.
         """
-        return decode(self._last_table('decode_flags')['flags'],
-                      return_bit_values=return_bit_values)
+        return decode_psf_flags(self._last_table('decode_flags')['flags'],
+                                return_bit_values=return_bit_values)
 
     def _last_table(self, method):
         """Return the table of the last call, for a method that needs it."""

@@ -54,6 +54,8 @@ __all__ = ['fit_mixture_field']
 _LOG = logging.getLogger('photutils_mgauss')
 # How often the field follows what bright stars are wider by.
 _FATTER_STEPS = 2
+# So large a share of the stars is not lost unless something is wrong.
+_LOST = 1 / 3
 # The weight of the centre in widths of the core, and at most in radii of the
 # stamp. A narrower one follows aberrations in a way that no distortion of low
 # degree can describe, a wider one sees more noise.
@@ -399,9 +401,24 @@ def _result(fit, sample, radius, choice, centre, fatter):
         warn_of_phase(middle)
     stddev = _centre_stddev(middle, radius, centre, field.pixel_integrated)
     table = star_table(fit, sample, stddev)
+    _warn_of_lost(field.dropped, table)
     if centre == 'catalogue':
         field = _moved(field, table, fit, core_width(middle))
     return replace(field, stars=table, centre_stddev=stddev)
+
+
+def _warn_of_lost(dropped, table):
+    """Warn if so many stars are not used that the list may be wrong."""
+    n_stars = np.count_nonzero(table['used']) + len(dropped)
+    reasons = [str(reason) for reason in dropped['reason']]
+    if len(reasons) <= _LOST * n_stars:
+        return
+    counts = ', '.join(f'{reasons.count(reason)} {reason}'
+                       for reason in sorted(set(reasons)))
+    warnings.warn(
+        f'{len(reasons)} of the {n_stars} stars given are not used ({counts}):'
+        ' check that x and y are those of this image, and that error and mask '
+        'are right', AstropyUserWarning, stacklevel=5)
 
 
 def _context_parts(fit, sample, n_terms):

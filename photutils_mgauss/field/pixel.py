@@ -69,7 +69,8 @@ def warn_of_phase(mixture):
             f'the light of the PSF that was fitted, added up over pixels, '
             f'changes by {error:.1%} (rms) with the place of a star in its '
             'pixel, and fluxes with it: the pixels are too coarse for a PSF '
-            'that is sampled; use pixel_integrated=True', AstropyUserWarning,
+            'that is sampled; use pixel_integrated=True (mgauss psf '
+            '--pixel-integrated)', AstropyUserWarning,
             stacklevel=5)
 
 

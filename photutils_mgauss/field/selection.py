@@ -4,6 +4,7 @@ import warnings
 import numpy as np
 from astropy.stats import mad_std
 from astropy.table import QTable, Table
+from astropy.utils.exceptions import AstropyUserWarning
 from photutils.detection import DAOStarFinder
 from photutils.utils.exceptions import NoDetectionsWarning
 from scipy.spatial import KDTree
@@ -145,7 +146,7 @@ def _detect(pixels, fwhm, threshold, finder):
         fwhm = 3.0 if fwhm is None else as_real(
             fwhm, 'fwhm', above=0, maximum=max(pixels.shape))
         if threshold is None:
-            threshold = 5 * mad_std(data[~mask])
+            threshold = 5 * _scatter(data[~mask])
         threshold = read_level(threshold, 'threshold', pixels.unit)
         threshold = as_real(threshold, 'threshold', above=0)
         # Below 1 photutils 3.1 makes a source of every pixel of a star.
@@ -162,6 +163,19 @@ def _detect(pixels, fwhm, threshold, finder):
         raise ValueError(msg)
     # The finder's flux is not that of the aperture used here.
     return Table({'x': found['x_centroid'], 'y': found['y_centroid']})
+
+
+def _scatter(values):
+    """Return the scatter of pixels; raise if they tell of none."""
+    if values.size == 0:
+        msg = 'data must have pixels that can be used, got none'
+        raise ValueError(msg)
+    scatter = mad_std(values)
+    if scatter == 0:
+        msg = ('data must have noise, got one value in half of the pixels or '
+               'more: mask them, or give a threshold')
+        raise ValueError(msg)
+    return scatter
 
 
 def _measure(pixels, sources, radius):
@@ -257,13 +271,19 @@ def _prefer(table, catalogue):
     """Keep only stars of the catalogue if they are enough, in place."""
     known = np.isfinite(catalogue.x) & np.isfinite(catalogue.y)
     usable = np.flatnonzero(np.asarray(table['reason']) == '')
-    if not known.any() or not usable.size:
-        return
-    tree = KDTree(np.column_stack([catalogue.x, catalogue.y])[known])
-    listed = tree.query(np.column_stack(
-        [table['x'], table['y']])[usable])[0] <= _MATCH
+    listed = np.zeros(usable.size, bool)
+    if known.any() and usable.size:
+        tree = KDTree(np.column_stack([catalogue.x, catalogue.y])[known])
+        listed = tree.query(np.column_stack(
+            [table['x'], table['y']])[usable])[0] <= _MATCH
     if listed.sum() >= _FEWEST_LISTED:
         table['reason'][usable[~listed]] = 'unlisted'
+        return
+    warnings.warn(
+        f'the catalogue is not used, because {listed.sum()} of its '
+        f'{known.sum()} sources are within {_MATCH:g} pix of good stars of '
+        f'the image, and at least {_FEWEST_LISTED} must be: check its x and '
+        'y, or give more', AstropyUserWarning, stacklevel=3)
 
 
 def _thin_out(table, max_stars, shape):

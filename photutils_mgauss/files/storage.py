@@ -235,9 +235,11 @@ def _native(column):
 
 def _check_class(found, cls, name):
     if found != cls.__name__:
+        remedy = (f'{found}.read takes it' if found else
+                  'GriddedMixturePSF.from_file takes the PSFs of other '
+                  'programs')
         msg = (f'{name}: file must hold a {cls.__name__}, got one with '
-               f'{found or "nothing of this package"}; '
-               'GriddedMixturePSF.from_file takes the PSFs of other programs')
+               f'{found or "nothing of this package"}; {remedy}')
         raise UnusableFileError(msg)
 
 

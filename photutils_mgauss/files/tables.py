@@ -44,7 +44,8 @@ def read_table(path):
     with undamaged(path, what):
         if is_fits(path):
             # Checks the sizes that the headers tell of.
-            with open_fits(path, what):
+            with open_fits(path, what) as hdus:
+                _refuse_ldac(hdus)
                 table = QTable.read(path)
         else:
             try:
@@ -52,7 +53,10 @@ def read_table(path):
             except IORegistryError as error:
                 # Its own words are followed by all formats there are.
                 msg = ('a file of none of the kinds that it recognises; '
-                       'images and PSFs are FITS or ASDF files')
+                       'images and PSFs are FITS or ASDF files, and lists of '
+                       "other programs are read in Python with QTable.read("
+                       "file, format='mgauss.daophot'), or the like, and "
+                       'written as ECSV')
                 raise OSError(msg) from error
         text = table.meta.get('MGRUN')
         record = (table.meta.get('mgauss', {}) if text is None
@@ -61,3 +65,13 @@ def read_table(path):
             msg = f'{record!r:.40} in place of the record of its run'
             raise TypeError(msg)
     return table, record
+
+
+def _refuse_ldac(hdus):
+    """Raise if the first table is the header of an image, as in LDAC files."""
+    if any(hdu.name == 'LDAC_IMHEAD' for hdu in hdus):
+        msg = ('a catalogue of SExtractor in the format LDAC, which begins '
+               'with the header of the image: in Python, read it with '
+               "QTable.read(file, format='mgauss.sextractor'), and write it "
+               'as ECSV')
+        raise OSError(msg)

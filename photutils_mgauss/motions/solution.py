@@ -35,6 +35,7 @@ from photutils_mgauss.motions.tables import (
     used_references,
 )
 from photutils_mgauss.sky.observers import julian_years, tdb
+from photutils_mgauss.utils.flags import decode
 from photutils_mgauss.utils.notebook import with_table
 from photutils_mgauss.utils.validation import as_integer
 from photutils_mgauss.utils.waiting import waiting
@@ -42,21 +43,23 @@ from photutils_mgauss.utils.waiting import waiting
 
 def decode_motion_flags(flags):
     """
-    Return the meaning of the flags of a star, in sentences.
+    Return the meaning of the flags of stars, in sentences.
 
     Parameters
     ----------
-    flags : int
-        A value of the column ``flags`` of `MotionSolution.stars`.
+    flags : int or array_like of int
+        One flag, or the column ``flags`` of `MotionSolution.stars`.
 
     Returns
     -------
-    list of str
+    list
+        A sentence for each bit that is set; of an array, a nested list of
+        its shape with such a list for each flag.
 
     Raises
     ------
     TypeError, ValueError
-        If ``flags`` is no integer, or negative.
+        If ``flags`` are not integers, or negative.
 
     Examples
     --------
@@ -64,8 +67,8 @@ def decode_motion_flags(flags):
     >>> decode_motion_flags(8)
     ['outlier: a detection was rejected as an outlier']
     """
-    flags = as_integer(flags, 'flags', minimum=0)
-    return [sentence for bit, sentence in FLAGS.items() if flags & bit]
+    return decode(flags, lambda flag: [
+        sentence for bit, sentence in FLAGS.items() if flag & bit])
 
 
 def solution_of(result, ref_epoch=None):

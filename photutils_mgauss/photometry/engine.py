@@ -14,6 +14,7 @@ import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.base import PSFModel
+from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.rows import falls
 from photutils_mgauss.utils.parallel import Threads, map_parallel
 from photutils_mgauss.utils.waiting import progress
@@ -65,7 +66,18 @@ def _full_mask(data, mask):
 
 
 def as_model(psf):
-    """Return a PSF as a model; fields are sampled on a grid."""
+    """
+    Return a PSF as a model; fields are sampled on a grid.
+
+    Raises
+    ------
+    TypeError
+        If it is a mixture, which has neither a position nor a flux.
+    """
+    if isinstance(psf, GaussianMixture):
+        msg = ('psf_model must be a model with a position and a flux, got a '
+               'GaussianMixture: give MultiGaussianPSFModel(mixture)')
+        raise TypeError(msg)
     return psf.to_grid() if hasattr(psf, 'to_grid') else psf
 
 

@@ -1,5 +1,7 @@
 """Flags of stars in words."""
-from photutils_mgauss.utils.flags import decode
+from functools import partial
+
+from photutils_mgauss.utils.flags import decode, names_of_bits
 
 __all__ = ['decode_psf_flags']
 
@@ -36,4 +38,5 @@ def decode_psf_flags(flags, *, return_bit_values=False):
     >>> decode_psf_flags([0, 8 + 262144])
     [[], ['no_convergence', 'not_a_star']]
     """
-    return decode(flags, return_bit_values=return_bit_values)
+    return decode(flags, partial(names_of_bits,
+                                 return_bit_values=return_bit_values))

@@ -31,6 +31,7 @@ from photutils_mgauss.photometry.contexts import (
 )
 from photutils_mgauss.photometry.errors import with_all_errors
 from photutils_mgauss.photometry.fitter import MixtureFitter, as_max_steps
+from photutils_mgauss.photometry.given import checked, put_back
 from photutils_mgauss.photometry.saturated import (
     SaturatedStars,
     flag,
@@ -277,11 +278,12 @@ class MixturePSFPhotometry(PSFPhotometry):
         if not self._can_fit:
             return super().__call__(data, mask=pixels.mask, error=error,
                                     init_params=init_params)
-        given = init_params
+        given, places = checked(self, init_params)
         data, mask, error, init_params = compat.prepare_inputs(
-            self, data, pixels.mask, error, init_params)
+            self, data, pixels.mask, error, given)
         if init_params is None:
             return None
+        put_back(init_params, places)
         keep_contexts(self.psf_model, given, init_params)
         self._check_inputs(init_params)
         self.init_params = init_params
@@ -419,9 +421,6 @@ class MixturePSFPhotometry(PSFPhotometry):
     def _check_inputs(self, init_params):
         if not self._free.any():
             msg = 'psf_model must have a free parameter, got none'
-            raise ValueError(msg)
-        if len(init_params) == 0:
-            msg = 'init_params must contain at least one row, got none'
             raise ValueError(msg)
         ids, counts = np.unique(np.asarray(init_params['id']),
                                 return_counts=True)

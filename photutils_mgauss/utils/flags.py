@@ -49,9 +49,15 @@ def _name(bit):
     return names[0] if names else f'unknown_bit_{bit}'
 
 
-def decode(flags, *, return_bit_values=False):
+def decode(flags, words_of=names_of_bits):
     """
-    Return `names_of_bits` of a flag, or of each, nested as they are.
+    Return the words of a flag, or of each of many, nested as they are.
+
+    Parameters
+    ----------
+    flags : int or array_like of int
+    words_of : callable, optional
+        Given a flag, it returns a list.
 
     Raises
     ------
@@ -71,8 +77,7 @@ def decode(flags, *, return_bit_values=False):
         raise ValueError(msg)
     # Few of the many flags of a table differ.
     values, which = np.unique(flags, return_inverse=True)
-    words = [names_of_bits(value, return_bit_values=return_bit_values)
-             for value in values]
+    words = [words_of(int(value)) for value in values]
     return _nest(which.reshape(flags.shape), words)
 
 

@@ -52,7 +52,59 @@ def test_info_says_that_a_text_is_none_of_the_files(folder, capsys):
     assert capsys.readouterr().err.strip() == (
         'mgauss: notes.md: must be a table that astropy can read, got a file '
         'of none of the kinds that it recognises; images and PSFs are FITS '
-        'or ASDF files')
+        'or ASDF files, and lists of other programs are read in Python with '
+        "QTable.read(file, format='mgauss.daophot'), or the like, and written "
+        'as ECSV')
+
+
+def test_info_goes_on_after_files_that_are_none_of_its_kinds(folder, capsys):
+    (folder / 'notes.md').write_text('# Stars\n\nSome *words*.\n')
+    assert main(['info', 'missing.fits', 'night.fits', 'notes.md',
+                 'stars.ecsv']) == 1
+    said, wrong = capsys.readouterr()
+    assert 'night.fits: an image' in said
+    assert 'stars.ecsv: a table of 1 rows' in said
+    first, last = wrong.splitlines()
+    assert first.startswith('mgauss: missing.fits: must be a file')
+    assert last.startswith('mgauss: notes.md: must be a table')
+
+
+def test_info_says_what_the_files_of_a_folder_are(folder, capsys):
+    assert main(['info', str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert 'night.fits: an image' in said
+    assert 'stars.ecsv: a table of 1 rows' in said
+
+
+def test_info_reads_models_of_psfex_before_it_calls_them_so(folder, capsys):
+    hdu = fits.BinTableHDU.from_columns([fits.Column(
+        'PSF_MASK', '1875E', dim='(25,25,3)',
+        array=np.ones((1, 3, 25, 25)))], name='PSF_DATA')
+    hdu.header.update(POLNAXIS=2, POLNGRP=1, POLNAME1='X_IMAGE',
+                      POLNAME2='Y_IMAGE', POLGRP1=1, POLGRP2=1, POLZERO1=1.0,
+                      POLZERO2=1.0, POLSCAL1=1.0, POLSCAL2=1.0, POLDEG1=1,
+                      PSF_SAMP=0.5, PSFNAXIS=3, PSFAXIS1=25, PSFAXIS2=25,
+                      PSFAXIS3=3)
+    hdu.writeto('good.psf')
+    hdu.header['POLDEG1'] = 2
+    hdu.writeto('bad.psf')
+    assert main(['info', 'good.psf']) == 0
+    assert ('25 x 25 samples of 0.5 pix, 3 terms of a polynomial of X_IMAGE '
+            'and Y_IMAGE') in capsys.readouterr().out
+    assert main(['info', 'bad.psf']) == 1
+    assert 'undamaged PSFEx model' in capsys.readouterr().err
+
+
+def test_the_header_in_a_catalogue_of_sextractor_is_no_table_of_stars(
+        folder, capsys):
+    head = fits.BinTableHDU.from_columns([fits.Column(
+        'Field Header Card', '80A', array=['SIMPLE = T'])],
+        name='LDAC_IMHEAD')
+    objects = fits.BinTableHDU.from_columns([fits.Column(
+        'X_IMAGE', 'E', array=[3.0])], name='LDAC_OBJECTS')
+    fits.HDUList([fits.PrimaryHDU(), head, objects]).writeto('ldac.fits')
+    assert main(['info', 'ldac.fits']) == 1
+    assert "format='mgauss.sextractor'" in capsys.readouterr().err
 
 
 def test_without_a_command_there_is_help(capsys):
@@ -82,3 +134,13 @@ def test_a_dry_run_finds_what_is_wrong(folder, capsys):
 def test_a_shell_can_learn_the_words():
     from photutils_mgauss.cli.command import make_parser
     assert 'info' in make_parser().format_help()
+
+
+@pytest.mark.parametrize('words', [
+    'psf night.fits --n-components 0',
+    'photometry night.fits --psf psf.fits --fit-shape 4'])
+def test_values_that_no_fit_takes_are_wrong_usage(folder, capsys, words):
+    with pytest.raises(SystemExit) as stop:
+        main([*words.split(), '--dry-run'])
+    assert stop.value.code == 2
+    assert 'must be' in capsys.readouterr().err.splitlines()[-1]

@@ -69,6 +69,18 @@ def test_a_psf_of_few_stars_is_not_good(tmp_path):
     assert '20 stars for the 15 terms' in verdict.words
 
 
+@pytest.mark.parametrize(('accuracy', 'good'), [(0.002, True), (0.03, False)])
+def test_a_psf_that_misses_much_of_the_light_is_not_good(
+        tmp_path, accuracy, good):
+    PSF.write(tmp_path / 'psf.fits')
+    with fits.open(tmp_path / 'psf.fits', mode='update') as hdus:
+        hdus[0].header['MGRUN'] = json.dumps(
+            {'n_stars': 11, 'degree': 1, 'accuracy': accuracy})
+    verdict = section_of(tmp_path / 'psf.fits').verdict
+    assert verdict.good == good
+    assert ('it misses 3.0% of the light' in verdict.words) != good
+
+
 def test_the_page_begins_with_the_verdicts(measured):
     page = html_page('title', [section_of(measured)],
                      {'date': 'today', 'version': '1'})

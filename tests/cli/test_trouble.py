@@ -241,7 +241,7 @@ def test_a_file_that_cannot_be_written_is_called_by_its_name(tmp_path):
     ('photometry a.fits --psf b.fits --treshold 3',
      'unrecognized arguments: --treshold 3 (did you mean --threshold?)'),
     ('psf a.fits --n-components three',
-     'must be a whole number from 0 or auto, got three'),
+     'must be a whole number from 1 or auto, got three'),
     ('psf a.fits --gain much', 'must be a positive number, got much'),
     ('psf a.fits --sky-box 1.5', 'must be a whole number from 1, got 1.5')])
 def test_wrong_usage_is_explained_by_the_command(capsys, words, said):

@@ -349,3 +349,20 @@ def sizes(field):
     """Return the standard deviations along the axes (K, 2) of Gaussians."""
     values = np.linalg.eigvalsh(field.mixture_at(120, 100).covariances)
     return np.sqrt(values)
+
+
+def test_a_list_of_which_many_places_hold_no_star_is_said(rng):
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(20.0, 230, 30),
+                                           np.arange(20.0, 190, 30)))
+    x, y = x + rng.uniform(-4, 4, x.size), y + rng.uniform(-4, 4, y.size)
+    light = sum(true_psf(120, 100).render(SHAPE, *place, flux=2e4)
+                for place in zip(x, y, strict=True))
+    error = np.sqrt(light + 25)
+    data = rng.normal(light, error)
+    how = {'error': error, 'n_components': 1, 'degree': 0, 'radius': 8}
+    exchanged = Table({'x': np.append(y, x[:20]), 'y': np.append(x, y[:20])})
+    with pytest.warns(AstropyUserWarning,
+                      match=r'62 stars given are not used \(.*outside'):
+        field = fit_mixture_field(data, exchanged, **how)
+    assert len(field.dropped) > 20
+    fit_mixture_field(data, Table({'x': x, 'y': y}), **how)

@@ -1,7 +1,10 @@
 """Every star that cannot show the PSF is rejected, with its reason."""
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from astropy.table import Table
+from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss import GaussianMixture, select_psf_stars
 
@@ -146,7 +149,28 @@ def test_stars_of_a_catalogue_are_preferred_if_they_are_enough(rng):
     data, places, is_star = small_galaxies(rng, 50, (420, 420))
     for n, reason in ((20, 'unlisted'), (5, '')):
         x, y = places[is_star][:n].T
-        table = select_psf_stars(data, catalogue=Table({'x': x, 'y': y}))
+        with (pytest.warns(AstropyUserWarning, match='5 of its 5 sources')
+              if reason == '' else nullcontext()):
+            table = select_psf_stars(data, catalogue=Table({'x': x, 'y': y}))
         other = places[is_star][25]
         assert reason_at(table, *other) == reason
         assert reason_at(table, x[0], y[0]) == ''
+
+
+@pytest.mark.parametrize('catalogue', [
+    {'x': [], 'y': []}, {'x': [-50.0, 900.0], 'y': [20.0, 20.0]},
+    {'x': [y for _, y in GOOD], 'y': [x for x, _ in GOOD]}])
+def test_a_catalogue_of_other_places_is_said(data, catalogue):
+    with pytest.warns(AstropyUserWarning, match='check its x and y'):
+        table = select_psf_stars(data, catalogue=Table(catalogue))
+    assert table['selected'].sum() == len(GOOD)
+
+
+@pytest.mark.parametrize(('value', 'words'), [
+    (1.0, 'must have noise, got one value'),
+    (np.nan, 'must have pixels that can be used')])
+def test_an_image_of_nothing_is_said_without_a_threshold(value, words):
+    with (pytest.warns(AstropyUserWarning, match='no pixel')
+          if np.isnan(value) else nullcontext()), \
+            pytest.raises(ValueError, match=words):
+        select_psf_stars(np.full(SHAPE, value))

@@ -2,7 +2,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.table import Table
+from astropy.table import Column, Table
 from numpy.testing import assert_allclose
 
 from helpers.motion_scenes import (
@@ -360,3 +360,10 @@ def test_a_scan_along_one_direction_is_one_measurement(rng):
     assert star['dof'] == n - 4
     assert_allclose(star['uwe'], np.sqrt(chi2[0] / along**2 / (n - 4)),
                     rtol=0.01)
+
+
+def test_flags_of_a_whole_column_are_put_into_words():
+    one = decode_motion_flags(8)
+    assert decode_motion_flags(Column([8, 0])) == [one, []]
+    with pytest.raises(TypeError, match='flags must be integers'):
+        decode_motion_flags([1.5])

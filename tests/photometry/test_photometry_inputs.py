@@ -6,17 +6,20 @@ import warnings
 from functools import partial
 from itertools import product
 
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import QTable, Table
 from numpy.testing import assert_allclose, assert_array_equal
-from photutils.psf import PSFPhotometry
+from photutils.psf import PSFPhotometry, SourceGrouper
 
 from helpers.star_images import MIXTURE, PSF
 from photutils_mgauss import (
+    CrowdedMixturePhotometry,
     MixtureField,
     MixtureFitter,
     MixturePSFPhotometry,
+    decode_psf_flags,
 )
 
 SHAPE = (121, 141)
@@ -216,3 +219,51 @@ def test_an_interrupt_ends_all_threads_within_a_second(rng):
         signal.signal(signal.SIGALRM, before)
     # On all cores together.
     assert time.process_time() - at[0] < 1
+
+
+@pytest.mark.parametrize(('table', 'error', 'words'), [
+    (Table({'x': [], 'y': []}), ValueError, 'at least one row, got none'),
+    (Table({'ra': [1.0], 'dec': [2.0]}), ValueError,
+     r"such as x_init and y_init, or x and y, got \['ra', 'dec'\]"),
+    (Table({'x': ['a'], 'y': [2.0]}), TypeError,
+     "column 'x' must hold numbers"),
+    (QTable({'x': [2.0] * u.deg, 'y': [2.0] * u.deg}), ValueError,
+     "column 'x' must have a unit like pix, got deg"),
+])
+def test_a_list_that_is_none_of_places_in_pixels_is_said(table, error, words):
+    photometry = MixturePSFPhotometry(PSF, 9, aperture_radius=3)
+    with pytest.raises(error, match=words):
+        photometry(np.ones((31, 31)), error=1.0, init_params=table)
+
+
+@pytest.mark.parametrize('masked', [True, False])
+def test_a_star_without_a_place_spoils_no_other_if_fluxes_are_unknown(
+        rng, masked):
+    x, y = np.array([15.2, 40.3, 70.1, 100.4]), np.full(4, 30.6)
+    data, error = observe(x, y, np.full(4, 2e4), rng)
+    photometry = MixturePSFPhotometry(PSF, 9, aperture_radius=3,
+                                      grouper=SourceGrouper(5))
+    clean = photometry(data, error=error, init_params=Table(
+        {'x': x[2:], 'y': y[2:]}))
+    if masked:
+        bad = Table({'x': np.ma.array(x, mask=[1, 0, 0, 0]),
+                     'y': np.ma.array(y, mask=[0, 1, 0, 0])})
+    else:
+        bad = Table({'x': [np.nan, *x[1:]], 'y': [y[0], np.inf, *y[2:]]})
+    with warnings.catch_warnings():
+        warnings.simplefilter('error', RuntimeWarning)
+        table = photometry(data, error=error, init_params=bad)
+    assert len(table) == 4
+    assert np.isnan(table['x_fit'][:2]).all()
+    assert_allclose(table['x_fit'][2:], clean['x_fit'], atol=1e-12)
+    assert_allclose(table['flux_fit'][2:], clean['flux_fit'], rtol=1e-12)
+    assert not np.isfinite(table['x_init'][0] + table['y_init'][0])
+    assert all('no_overlap' in words or 'non_finite_position' in words
+               for words in decode_psf_flags(table['flags'][:2]))
+
+
+def test_a_mixture_is_no_model_and_the_sentence_says_what_is():
+    for call in (lambda: MixturePSFPhotometry(MIXTURE, 9),
+                 lambda: CrowdedMixturePhotometry(MIXTURE)):
+        with pytest.raises(TypeError, match=r'MultiGaussianPSFModel\(mix'):
+            call()
