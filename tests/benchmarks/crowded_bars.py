@@ -94,9 +94,12 @@ def galaxy(bars, args, optics):
     alone, *both = scenes.galaxy_part(args, optics)
     bars.add('the same stars without a galaxy: false there', 0.05,
              alone[1:, 2], '.1%')
+    bars.add('the same, no star within 1 pixel', 0.05, alone[1:, 3], '.1%')
     for index, rows in zip((1, 4), both, strict=True):
         bars.add(f'galaxy, n = {index}: false beyond 40 pixels', 0.05,
                  rows[1:, 2], '.1%')
+        bars.add(f'galaxy, n = {index}: no star within 1 pixel', 0.05,
+                 rows[1:, 3], '.1%')
         bars.add(f'galaxy, n = {index}: stars found within', 0.5, rows[0, 1],
                  '.1%', least=True)
 

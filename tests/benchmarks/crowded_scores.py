@@ -176,10 +176,10 @@ class Score:
     false: np.ndarray
 
     @classmethod
-    def of(cls, scene, table, *, centred=False):
-        """Centre and match a list."""
+    def of(cls, scene, table, *, centred=False, radius=RADIUS):
+        """Centre and match a list, within a radius [pix]."""
         table = table if centred else centre(scene, table)
-        true, row = pair(scene, table)
+        true, row = pair(scene, table, radius)
         n, truth = scene.size, scene.truth
 
         def inside(t):
