@@ -33,7 +33,7 @@ _FLATTEST, _STEEPEST = 2.5, 6.0
 # What is expected of them: diffraction's, within a Cauchy distribution of this
 # width, whose tails let stars say otherwise, as those of seeing do.
 _USUAL_SLOPE, _SLOPE_WIDTH = 3.0, 0.25
-_CLIP = 4.0
+_CLIP, _LEAST_SCATTER = 4.0, 1e-75
 _FEWEST_STARS = 5
 # Light that is seen beyond doubt [standard deviations].
 _SEEN = 5.0
@@ -223,7 +223,8 @@ def _light_beyond(flux, means, counts, middle):
                 for slope in slopes]
         best = min(fits, key=lambda fit: fit.chi2)
         pulls = best.residual * np.sqrt(counts)
-        scatter = max(mad_std(pulls[kept]), 1e-300)
+        # In an image without noise it is 0; its square must not be.
+        scatter = max(mad_std(pulls[kept]), _LEAST_SCATTER)
         kept = (counts > 0) & (np.abs(pulls) < _CLIP * scatter)
     heights, errors, chi2 = (np.array([getattr(fit, name) for fit in fits])
                              for name in ('height', 'error', 'chi2'))

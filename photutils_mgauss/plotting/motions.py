@@ -6,6 +6,7 @@ from photutils_mgauss.plotting.style import (
     BLUE,
     GREY,
     ORANGE,
+    colour_bar,
     current_axes,
     round_length,
 )
@@ -257,9 +258,11 @@ def plot_proper_motions(stars, *, membership=None, ax=None):
     reference = _is_reference(stars)
     if membership is not None:
         free = ~reference & np.isfinite(np.asarray(membership))
-        ax.scatter(stars['pmra'][free].value, stars['pmdec'][free].value, 9,
-                   np.asarray(membership)[free], cmap='viridis', vmin=0,
-                   vmax=1, zorder=3)
+        shown = ax.scatter(
+            stars['pmra'][free].value, stars['pmdec'][free].value, 9,
+            np.asarray(membership)[free], cmap='viridis', vmin=0, vmax=1,
+            zorder=3)
+        colour_bar(ax, shown, 'membership')
     for which, colour, label in ((~reference, BLUE, 'stars'),
                                  (reference, ORANGE, 'references')):
         some = stars[which]

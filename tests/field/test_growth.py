@@ -168,3 +168,15 @@ def test_a_known_psf_keeps_its_own_wings(sharp, fields):
         fit_mixture_field(data, stars, error=error,
                           start=fields['stamps'].to_grid((2, 2)),
                           normalise='curve-of-growth')
+
+
+def test_rings_of_one_value_tell_of_no_light():
+    profile = moffat(2.5, 3.0)
+    stars = image(profile)[2]
+    rows, columns = np.mgrid[:SHAPE[0], :SHAPE[1]]
+    clean = sum(f * profile(columns - a, rows - b)
+                for a, b, f in stars.iterrows('x', 'y', 'flux'))
+    field = fit_mixture_field(np.where(clean > 2000, 1.0, 0.0),
+                              stars['x', 'y'], error=1e-3, n_components=1,
+                              degree=0, radius=8)
+    assert field.wing_share == 0
