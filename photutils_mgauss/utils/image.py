@@ -320,6 +320,9 @@ def _numbers(value, name):
         raise TypeError(msg) from reason
     if array.dtype.kind not in 'buif':
         got = array.dtype if array.ndim else f'{value!r:.80}'
+        one = value[0] if isinstance(value, (list, tuple)) else value
+        if hasattr(one, 'header'):
+            got = f'{type(one).__name__}: give its .data'
         msg = f'{name} must be an array of numbers, got {got}'
         raise TypeError(msg)
     if array.dtype.kind == 'b':

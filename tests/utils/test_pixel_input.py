@@ -7,6 +7,7 @@ import numpy as np
 import photutils
 import pytest
 from astropy.coordinates import SkyCoord
+from astropy.io import fits
 from astropy.nddata import (
     CCDData,
     InverseVariance,
@@ -344,6 +345,9 @@ REFUSED = {
     'ragged': (
         {'data': [[1, 2], [3]]}, TypeError,
         r'(data|image) must be an array of numbers, got \[\[1'),
+    'an HDU': (
+        {'data': fits.ImageHDU(DATA)}, TypeError,
+        r'must be an array of numbers, got ImageHDU: give its .data'),
     'objects': (
         {'data': DATA.astype(object)}, TypeError,
         r'(data|image) must be an array of numbers, got object'),
