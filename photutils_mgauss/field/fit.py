@@ -20,7 +20,7 @@ from photutils_mgauss.field.base import (
     residual_stars,
     star_table,
 )
-from photutils_mgauss.field.beyond import add_degree
+from photutils_mgauss.field.beyond import add_degrees
 from photutils_mgauss.field.brighter_fatter import measure_fattening
 from photutils_mgauss.field.choice import MANY_STARS, choose
 from photutils_mgauss.field.contexts import lateral_shifts
@@ -338,7 +338,7 @@ def _free(problem, n_components, degree, top, workers, strength, reject):
     fit = stages.run(problem, n_components, degree, workers,
                      strength=strength, reject=reject)
     if few:
-        fit = add_degree(fit, problem.basis, degree, workers, reject=reject)
+        fit = add_degrees(fit, problem.basis, degree, workers, reject=reject)
     if problem.pixel_integrated:
         _allow_for_misfit(fit, workers)
     return fit, choice
