@@ -47,8 +47,8 @@ from photutils_mgauss.field.normal import (
 _ROUNDS = 2
 # By how much variances fall with each degree.
 _FALL = 0.25
-# Standard deviations of l and h. Those h that optics of simulated telescopes
-# have with hundreds of stars differ by 0.6.
+# Standard deviations of l and h. Those h that simulated optics have with
+# hundreds of stars scatter by 0.7 about 0; others may differ more.
 _WIDTHS = np.repeat([2.0, 1.0], 3)
 _LIMITS = (-9.0, 3.0)
 _TOLERANCE, _MOST_STEPS = 0.1, 100
