@@ -21,7 +21,7 @@ SIZE, FLUX = 160, 3e4
 
 @pytest.fixture
 def linear():
-    """A fit of data that are linear in 3 x 2 coefficients."""
+    """Return a fit of data that are linear in 3 x 2 coefficients."""
     rng = np.random.default_rng(3)
     design = rng.normal(size=(12, 6))
     data, coefficients = rng.normal(size=12), rng.normal(size=(3, 2))
