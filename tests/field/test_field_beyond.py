@@ -83,12 +83,11 @@ def scene(rng, n_psf):
     return clean, np.sqrt(clean + 50), stars[:n_psf], stars[n_psf:]
 
 
-@pytest.mark.parametrize('n_psf', [8, 15])
-def test_errors_know_of_terms_that_few_stars_do_not_tell(n_psf):
+def test_errors_know_of_terms_that_few_stars_do_not_tell():
     squares = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        clean, error, stars, test = scene(rng, n_psf)
+        clean, error, stars, test = scene(rng, 8)
         field = fit_mixture_field(
             clean + rng.normal(0, error), stars, error=error, n_components=1,
             radius=6, correlated_noise=False, normalise='stamps')
