@@ -43,6 +43,11 @@ def by_default(n_components, degree, n_stars):
             usual[1] if degree is None else degree)
 
 
+def full_degree(degree):
+    """Return the degree up to which there are terms if few stars chose one."""
+    return max(degree + 1, _USUAL_DEGREE)
+
+
 def choose(problem, n_components, degree, max_degree, strength, workers):
     """
     Replace 'auto' by what describes left-out stars best.
@@ -157,21 +162,6 @@ def _left_out(fit, workers):
             damping=_FOLD_DAMPING)
         chi2[folds == fold] = _settled(outside, coefficients, workers)
     return chi2
-
-
-def is_better(before, after, workers):
-    """
-    Return whether the second of two fits is the better one.
-
-    That which describes more of the stars or, of as many, that which those
-    left out of it are more like.
-    """
-    more = after.problem.used.sum() - before.problem.used.sum()
-    if more:
-        return more > 0
-    scores = _mean(np.array([_left_out(one, workers)
-                             for one in (before, after)]))
-    return scores[1] < scores[0]
 
 
 def _settled(problem, coefficients, workers):

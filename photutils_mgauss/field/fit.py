@@ -20,7 +20,7 @@ from photutils_mgauss.field.base import (
     residual_stars,
     star_table,
 )
-from photutils_mgauss.field.beyond import add_degree
+from photutils_mgauss.field.beyond import add_degrees
 from photutils_mgauss.field.brighter_fatter import measure_fattening
 from photutils_mgauss.field.choice import MANY_STARS, choose
 from photutils_mgauss.field.contexts import lateral_shifts
@@ -107,10 +107,11 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         everywhere; by default 4, or 'auto' with 8 to 59 stars, or 1 with
         ``start``. It is lowered, with a warning, if there are too few
         stars. 'auto' chooses a degree from 0 to 5 in the same way; with
-        fewer than 60 stars it adds terms of one degree more, with a prior
-        about zero, if they describe left-out stars better. Terms that are
-        not significant are shrunk, so that a degree that is too high takes
-        more time but loses little accuracy.
+        fewer than 60 stars the field has the terms of one degree more, and
+        of all up to 4, with a prior about zero, so that errors include what
+        the stars cannot tell of them. Terms that are not significant are
+        shrunk, so that a degree that is too high takes more time but loses
+        little accuracy.
     radius : float, optional
         The radius of the circle of fitted pixels [pix]. By default four
         times the width at half maximum of the stars, but at least 10 and
@@ -338,7 +339,7 @@ def _free(problem, n_components, degree, top, workers, strength, reject):
     fit = stages.run(problem, n_components, degree, workers,
                      strength=strength, reject=reject)
     if few:
-        fit = add_degree(fit, problem.basis, degree, workers, reject=reject)
+        fit = add_degrees(fit, problem.basis, degree, workers, reject=reject)
     if problem.pixel_integrated:
         _allow_for_misfit(fit, workers)
     return fit, choice

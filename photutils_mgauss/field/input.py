@@ -9,7 +9,7 @@ from astropy.table import QTable, Table
 from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss.field import stages
-from photutils_mgauss.field.choice import DEGREES, n_folds
+from photutils_mgauss.field.choice import DEGREES, full_degree, n_folds
 from photutils_mgauss.field.contexts import Contexts, context_terms
 from photutils_mgauss.field.forms import FreeShapes
 from photutils_mgauss.field.normal import FieldProblem
@@ -88,10 +88,10 @@ class Sample:
         """
         Return the problem of a field with polynomials of a degree.
 
-        Those of one degree more are in its basis.
+        Those of higher degrees that few stars get are in its basis.
         """
         places = normalised(*self.expected(), self.shape)
-        basis = stages.polynomials(*places, degree + 1)
+        basis = stages.polynomials(*places, full_degree(degree))
         hold = np.full(self.sources.shape, _NEIGHBOUR_STDDEV**-2.0)
         hold[..., 2] = 1 / np.maximum(self.sources[..., 2] ** 2, 1e-300)
         n = len(basis)
