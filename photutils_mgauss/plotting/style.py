@@ -24,7 +24,10 @@ def current_axes(ax):
 def colour_bar(ax, shown, label=''):
     """Draw a colour bar beside Axes, as high as these."""
     beside = ax.inset_axes((1.04, 0, 0.05, 1))
-    return ax.figure.colorbar(shown, cax=beside, label=label)
+    bar = ax.figure.colorbar(shown, cax=beside, label=label)
+    # Numbers of many digits would push the label out of a usual figure.
+    beside.ticklabel_format(axis='y', scilimits=(-2, 3), useMathText=True)
+    return bar
 
 
 def round_length(largest):
