@@ -54,8 +54,9 @@ __all__ = ['fit_mixture_field']
 _LOG = logging.getLogger('photutils_mgauss')
 # How often the field follows what bright stars are wider by.
 _FATTER_STEPS = 2
-# So large a share of the stars is not lost unless something is wrong.
-_LOST = 1 / 3
+# So large a share of the stars, and so many, are not lost unless something is
+# wrong.
+_LOST, _FEWEST_LOST = 1 / 3, 3
 # The weight of the centre in widths of the core, and at most in radii of the
 # stamp. A narrower one follows aberrations in a way that no distortion of low
 # degree can describe, a wider one sees more noise.
@@ -412,7 +413,7 @@ def _warn_of_lost(dropped, table):
     """Warn if so many stars are not used that the list may be wrong."""
     n_stars = np.count_nonzero(table['used']) + len(dropped)
     reasons = [str(reason) for reason in dropped['reason']]
-    if len(reasons) <= _LOST * n_stars:
+    if len(reasons) <= max(_LOST * n_stars, _FEWEST_LOST - 1):
         return
     counts = ', '.join(f'{reasons.count(reason)} {reason}'
                        for reason in sorted(set(reasons)))
