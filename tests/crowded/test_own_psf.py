@@ -110,8 +110,8 @@ def test_the_stars_are_spread_over_the_image():
 
 
 def test_none_is_the_psf_of_the_image():
-    data = image()['data'][:110, :110]
-    error = image()['error'][:110, :110]
+    data = image()['data'][:80, :80]
+    error = image()['error'][:80, :80]
     phot = CrowdedMixturePhotometry(None)
     table = phot(data, error=error)
     own = fit_crowded_psf(data, error=error)
