@@ -64,12 +64,17 @@ def _psf_verdict(fwhm, record):
     terms = (degree + 1) * (degree + 2) // 2
     words = (f'{words}; made of {stars} stars for the {terms} terms of a '
              f'polynomial of degree {degree}')
+    enough = stars >= 2 * terms
+    if not enough:
+        words = (f'{words}, of which so few stars determine only some; errors '
+                 'of positions and fluxes are larger for that, and more stars '
+                 'would reduce them')
     error = record.get('accuracy') or 0
     if error > _ACCURATE:
         words = (f'{words}; it misses {error:.1%} of the light in a pixel, so '
                  'bright stars are measured worse than their noise allows: '
                  'more stars or Gaussians may help')
-    return Verdict(stars >= 2 * terms and error <= _ACCURATE, words)
+    return Verdict(enough and error <= _ACCURATE, words)
 
 
 def _maps(psf, stars):
