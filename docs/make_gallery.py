@@ -96,6 +96,8 @@ def _draw(script, picture):
     with plt.rc_context(STYLE):
         figure = runpy.run_path(str(script))['figure']
     _check(figure, script)
+    # How wide the numbers beside colour bars are is known once they are drawn.
+    figure.draw_without_rendering()
     figure.savefig(picture, dpi=DPI)
     width = figure.get_size_inches()[0]
     figure.savefig(picture.with_name(f'{script.stem}_small.png'),

@@ -150,6 +150,8 @@ def _figure(title, panel):
     from matplotlib.figure import Figure
     figure = Figure(figsize=(5.2, 4.2), layout='constrained')
     panel.draw(figure.subplots())
+    # How wide the numbers beside colour bars are is known once they are drawn.
+    figure.draw_without_rendering()
     picture = BytesIO()
     figure.savefig(picture, format='png', dpi=120)
     data = b64encode(picture.getvalue()).decode()
