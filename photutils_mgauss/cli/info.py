@@ -1,15 +1,16 @@
 """``mgauss info``: what a file is, and how it would be read."""
 
-from photutils_mgauss.cli import tools
-from photutils_mgauss.cli.motions import is_table
+from photutils_mgauss.cli import info_psf, tools
+from photutils_mgauss.cli.catalogues import is_table
 from photutils_mgauss.cli.running import complain
 
 # What names of columns mean to the other commands.
 _COLUMNS = {
-    'positions in pixels': ('x_fit', 'y_fit', 'x', 'y', 'x_err', 'y_err'),
+    'positions in pixels': ('x_fit', 'y_fit', 'x', 'y', 'x_err', 'y_err',
+                            'xy_cov'),
     'positions on the sky': ('ra', 'dec', 'ra_error', 'dec_error', 'ra_err',
                              'dec_err'),
-    'fluxes': ('flux_fit', 'flux_err', 'flux', 'mag'),
+    'fluxes': ('flux_fit', 'flux_err', 'flux', 'mag', 'mag_err', 'snr'),
     'motions': ('pmra', 'pmdec', 'pmra_error', 'pmdec_error', 'parallax',
                 'parallax_error', 'ref_epoch'),
     'identities': ('id', 'source_id'),
@@ -17,7 +18,7 @@ _COLUMNS = {
     'times': ('time',)}
 _KINDS = {'mixtures': 'a PSF of this package', 'psfex': 'a PSF of PSFEx',
           'stdpsf': 'a grid of ePSFs in the format STDPSF',
-          'stpsf': 'a grid of PSFs of STPSF',
+          'stpsf': 'a grid of PSFs of STPSF (GriddedPSFModel)',
           'optical': 'an image of a PSF from calc_psf of STPSF',
           'epsf': 'an oversampled image of a PSF'}
 
@@ -61,53 +62,25 @@ def _lines(options, path, read):
     """Return the lines on one file."""
     from photutils_mgauss.files.epsfs import psf_kind
     kind = psf_kind(path)
-    if kind == 'image':
-        return (_of_table(path) if is_table(path)
-                else _of_image(path, read()))
+    if kind != 'image':
+        return _of_psf(options, kind, path)
+    if is_table(path):
+        return _of_table(path)
+    return _of_wcs_alone(path) or _of_image(path, read())
+
+
+def _of_psf(options, kind, path):
+    """Return what a PSF file holds, and what reads it."""
     lines = [f'{path}: {_KINDS[kind]}']
     if kind == 'mixtures':
-        return lines + _of_grid(path)
-    lines += _of_other_psf(kind, path)
+        from photutils_mgauss.cli.psf_files import psf_record
+        return lines + info_psf.of_mixtures(path) + _of_record(
+            psf_record(path))
+    lines += info_psf.of_other(kind, path, ext=options.ext,
+                               detector=options.detector)
     lines.append('  mgauss psf makes mixtures of it; photometry does so each '
                  'time')
     return lines
-
-
-def _of_grid(path):
-    """Return what a PSF of this package is."""
-    import numpy as np
-
-    from photutils_mgauss.cli.psf_files import psf_record, read_psf
-    from photutils_mgauss.psf.shapes import adaptive_moments
-    psf = read_psf(path)
-    ny, nx = psf.grid_shape
-    (left, bottom), (right, top) = (getattr(psf.grid_xypos, side)(axis=0)
-                                    for side in ('min', 'max'))
-    fwhm = np.atleast_1d(adaptive_moments(psf.mixtures).fwhm)
-    kind = ('integrated over pixels' if psf.pixel_integrated
-            else 'sampled at the middles of pixels')
-    nodes = (f'  {nx} x {ny} nodes of {psf.n_components} Gaussians, x '
-             f'{left:g} to {right:g}, y {bottom:g} to {top:g}')
-    width = (f'  FWHM {np.nanmin(fwhm):.2f} to {np.nanmax(fwhm):.2f} pix; '
-             f'{kind}')
-    return [nodes, width, *_of_record(psf_record(path))]
-
-
-def _of_other_psf(kind, path):
-    """Return what is in a PSF file that can be read at once."""
-    if kind != 'psfex':
-        return []
-    from photutils_mgauss.files.psfex import read_psfex
-    models = read_psfex(path, ext='all')
-    return [f'  extension {ext}: {_of_psfex(model)}'
-            for ext, model in models.items()]
-
-
-def _of_psfex(model):
-    n, ny, nx = model.planes.shape
-    variables = ' and '.join(model.contexts) or 'nothing'
-    return (f'{nx} x {ny} samples of {model.sampling:g} pix, {n} terms of a '
-            f'polynomial of {variables}')
 
 
 def _of_record(record):
@@ -116,6 +89,23 @@ def _of_record(record):
         return []
     return [(f'  made by mgauss {record.get("command")} on '
             f'{record.get("date")}, version {record.get("version")}')]
+
+
+def _of_wcs_alone(path):
+    """Return what a WCS without an image is, None for all other files."""
+    from photutils_mgauss.files.image_layers import wcs_alone
+    wcs = wcs_alone(path)
+    if wcs is None:
+        return None
+    kind = 'a gwcs' if hasattr(wcs, 'available_frames') else 'a FITS WCS'
+    ny, nx = wcs.array_shape or (None, None)
+    size = 'of unknown size' if nx is None else f'{nx} x {ny} pixels'
+    x, y = (0, 0) if nx is None else ((nx - 1) / 2, (ny - 1) / 2)
+    place = wcs.pixel_to_world(x, y).icrs
+    where = (f'  {kind} of an image {size}; pixel ({x:g}, {y:g}) is at ra '
+             f'{place.ra.deg:.6f}, dec {place.dec.deg:.6f} deg')
+    return [f'{path}: a WCS without an image', where,
+            '  psf, photometry and motions take it with --wcs']
 
 
 def _of_image(path, image):
@@ -137,7 +127,9 @@ def _of_table(path):
     """Return what the columns of a table are taken for."""
     from photutils_mgauss.files.tables import read_table
     table, record = read_table(path)
-    lines = [f'{path}: a table of {len(table)} rows']
+    program = table.meta.get('program')
+    lines = [f'{path}: a table of {len(table)} rows' if program is None
+             else f'{path}: a star list of {program}, {len(table)} stars']
     for meaning, names in _COLUMNS.items():
         found = [name for name in names if name in table.colnames]
         if found:
@@ -146,8 +138,31 @@ def _of_table(path):
     others = [name for name in table.colnames if name not in known]
     if others:
         lines.append(f'  {len(others)} other columns: {", ".join(others)}')
+    if program is not None:
+        lines += [f'  {table.meta["pixel_origin"]}', *_of_list(path, table)]
     exposure = record.get('exposure', {})
     if exposure:
         lines.append('  measured on '
                      f'{exposure.get("image", "an unknown image")}')
     return lines + _of_record(record)
+
+
+def _of_list(path, table):
+    """Return what a star list says of its errors, and what it lacks."""
+    from photutils_mgauss.files.ldac_headers import read_ldac_header
+    inside = (read_ldac_header(path)
+              if table.meta['program'] == 'SExtractor' else None)
+    lines = ([f'  errors of positions: {table.meta["position_errors"]}']
+             if 'position_errors' in table.meta else [])
+    needed = []
+    if inside is None or inside.wcs is None:
+        needed.append('--wcs or --plane')
+    if 'time' not in table.colnames and (inside is None
+                                         or inside.time is None):
+        needed.append('--time')
+    if inside is not None:
+        lines.append(f'  of its image: {"a" if inside.wcs else "no"} WCS, '
+                     f'time {inside.time.isot if inside.time else "unknown"}')
+    words = f' with {" and ".join(needed)}' if needed else ''
+    lines.append('  mgauss psf takes it with --stars, mgauss motions' + words)
+    return lines

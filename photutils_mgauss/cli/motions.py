@@ -8,6 +8,7 @@ from pathlib import Path
 
 from photutils_mgauss.cli import chips, photometry, pixel_motions, tools
 from photutils_mgauss.cli import psf as psf_command
+from photutils_mgauss.cli.catalogues import is_table, read_catalogue
 from photutils_mgauss.cli.observers import check_observer, observer_at
 from photutils_mgauss.cli.progress import Progress
 from photutils_mgauss.cli.psf_stars import check_image, check_start
@@ -17,8 +18,6 @@ from photutils_mgauss.cli.results import (
     add_dry_run,
     file_marks,
 )
-
-_TABLE_SUFFIXES = ('.ecsv', '.csv', '.txt', '.dat', '.vot', '.xml', '.votable')
 
 # As many stars are too few to find out about the errors of exposures.
 _FEW = 5
@@ -38,9 +37,9 @@ def add(commands):
         'Match the stars of two or more exposures, or of one and a catalogue '
         'like that of Gaia, align the exposures on objects with known '
         'motions, and fit proper motions. Inputs are catalogues, of mgauss '
-        'photometry or with ra, dec and their errors, or images, which are '
-        'measured first. Without references the motions are relative to the '
-        'mean of the stars.',
+        'photometry, with ra, dec and their errors, or star lists of other '
+        'programs, or images, which are measured first. Without references '
+        'the motions are relative to the mean of the stars.',
         'mgauss motions night1_cat.ecsv night2_cat.ecsv '
         '--references quasars.ecsv', run)
     tools.add_inputs(parser, 'FILE', 'a catalogue or an image of each '
@@ -84,8 +83,9 @@ def _add_solution(parser):
                             'table, with id, ra, dec, pmra, pmdec, ref_epoch '
                             '(and errors), and a rough parallax to find them')
     group.add_argument('--systematic', type=_systematic, metavar='MAS',
-                       help='error of each exposure, added to the errors of '
-                            'its stars (default: fitted); magnitude also '
+                       help='error of each exposure, in pixels with --plane, '
+                            'added to the errors of its stars (default: '
+                            'fitted); magnitude also '
                             'corrects the errors of stars as a function of '
                             'magnitude')
     group.add_argument('--terms', nargs='+', default=[],
@@ -100,8 +100,8 @@ def _add_solution(parser):
                        metavar='MAS/YR', help='largest motion considered in '
                        'matching (default: %(default)s)')
     group.add_argument('--match-radius', type=tools.positive, metavar='MAS',
-                       help='largest distance of a match (default: from the '
-                            'errors)')
+                       help='largest distance of a match, in pixels with '
+                            '--plane (default: from the errors)')
     group.add_argument('--match-by', choices=('auto', 'id', 'sky',
                                               'pattern'), default='auto',
                        help='pattern finds wrong pointings, rolls and lists '
@@ -192,22 +192,6 @@ def _check(options):
         raise NotADirectoryError(msg)
 
 
-def is_table(path):
-    """Whether a file is a table rather than an image."""
-    if Path(path).suffix.lower() in _TABLE_SUFFIXES:
-        return True
-    from photutils_mgauss.files.image_layers import is_asdf, open_fits
-    from photutils_mgauss.files.tables import is_fits
-    if is_asdf(path):
-        return False
-    if not is_fits(path) and '.fit' not in Path(path).name.lower():
-        return True
-    with tools.about(path), open_fits(path) as hdus:
-        images = [hdu for hdu in hdus if hdu.is_image
-                  and hdu.header.get('NAXIS', 0) >= 2]
-        return not images and len(hdus) > 1
-
-
 class _Names:
     """The names of all files of a run."""
 
@@ -277,37 +261,11 @@ def _from_catalogue(options, piece):
 
 
 def _seen_in_catalogue(options, path, i):
-    from photutils_mgauss.files.tables import read_table
-    table, record = read_table(path)
-    exposure = record.get('exposure', {})
-    time = tools.parse_time(tools.one_each(options.time, len(options.inputs),
-                                           'time')[i])
-    if time is None:
-        time = exposure.get('time')
-    image = (chips.image_of(path, record) if options.chips else (path, None))
-    return _seen(options, path, table, _wcs_of(options, i, record), time,
+    found = read_catalogue(options, path, i)
+    image = (chips.image_of(path, found.record) if options.chips
+             else (path, None))
+    return _seen(options, path, found.table, found.wcs, found.time,
                  image=image)
-
-
-def _wcs_of(options, i, record):
-    """Return the WCS named by an option, or that of the record's image."""
-    from photutils_mgauss.cli.star_image import Reading, read_image
-    from photutils_mgauss.files.image_layers import read_wcs
-    given = tools.one_each(options.wcs, len(options.inputs), 'wcs')[i]
-    if given is not None:
-        return read_wcs(given)
-    exposure = record.get('exposure', {})
-    name = exposure.get('wcs') or exposure.get('image')
-    if name is None:
-        return None
-    file = Path(options.inputs[i]).resolve().parent / name
-    if not file.exists():
-        tools.say(options, f'{options.inputs[i]}: {file} is not there, which '
-                  'has its WCS; the places on the sky are used as they are')
-        return None
-    if exposure.get('wcs'):
-        return read_wcs(file)
-    return read_image(file, Reading(ext=exposure.get('ext'))).wcs
 
 
 def _seen(options, path, table, wcs, time, *, image):
@@ -405,16 +363,17 @@ def _fitter(options):
     radius, alone = options.match_radius, options.parallax_of is not None
     transform = options.transform or ('none' if alone else 'affine')
     systematic = options.systematic
+    length = u.pix if options.plane else u.mas
     return ProperMotionFitter(
         transform=None if transform == 'none' else transform,
         recipe=options.recipe, parallax=alone or options.parallax,
         references=_references(options),
         match_by='id' if alone else options.match_by,
-        systematic=(systematic * u.mas if isinstance(systematic, float)
+        systematic=(systematic * length if isinstance(systematic, float)
                     else systematic or 'fit'),
         terms=tuple(options.terms), **_distortion(options),
         max_motion=options.max_motion * u.mas / u.yr,
-        match_radius=None if radius is None else radius * u.mas)
+        match_radius=None if radius is None else radius * length)
 
 
 def _distortion(options):

@@ -1,5 +1,6 @@
 """The stars of an image that its PSF is fitted to."""
 from photutils_mgauss.cli import tools
+from photutils_mgauss.cli.catalogues import say_program
 
 _RADIUS = 10.0
 
@@ -38,6 +39,7 @@ def choose(image, radius, options):
     sources = None
     if options.stars is not None:
         sources, _ = read_table(options.stars)
+        say_program(options, options.stars, sources)
     saturation = image.saturation
     if saturation is not None:
         # The level is that of the image with its sky.

@@ -19,7 +19,7 @@ from photutils_mgauss.files.star_lists import (
 )
 from photutils_mgauss.utils.validation import as_choice
 
-__all__ = ['read']
+__all__ = ['letters_of', 'read']
 
 _FRAMES = {'raw': ('x', 'y'), 'corrected': ('X', 'Y'),
            'common': ('u', 'v')}
@@ -56,7 +56,7 @@ def read(file, *, frame=None, columns=None, fwhm=None):
     lines = lines_of(file)
     rows = number_rows([line if not line.lstrip().startswith('#') else ''
                         for line in lines], file)
-    letters = _letters(file, lines, rows.shape[1], columns)
+    letters = letters_of(file, lines, rows.shape[1], columns)
     values = dict(zip(letters, rows.T, strict=True))
     stars, used = _stars(file, values, frame)
     others = Table({_NAMES.get(letter, letter): column
@@ -68,7 +68,7 @@ def read(file, *, frame=None, columns=None, fwhm=None):
                     program='hst1pass')
 
 
-def _letters(file, lines, width, columns):
+def letters_of(file, lines, width, columns=None):
     """Return the name of each column: letters, errors as ex, ey, em."""
     if columns is not None and len(columns) != width:
         msg = (f'{file}: columns must name {width} columns with a letter '

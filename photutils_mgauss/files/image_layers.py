@@ -286,8 +286,20 @@ def _fits_wcs(hdus, hdu):
     if wcs is not None:
         return wcs
     # The lists of HDUs have the tables of distortions.
+    return wcs_of_header(hdu.header, hdus)
+
+
+def wcs_of_header(header, hdus=None):
+    """
+    Return the celestial WCS of a header, None if it has none.
+
+    Raises
+    ------
+    ValueError
+        If its keywords contradict each other.
+    """
     try:
-        return _celestial(WCS(hdu.header, hdus))
+        return _celestial(WCS(header, hdus))
     except Exception as error:
         # wcslib has errors of many kinds.
         words = ' '.join(str(error).split()) or type(error).__name__
@@ -358,12 +370,26 @@ def read_wcs(path):
         wcs = find_gwcs(read_asdf_tree(path))
     else:
         with open_fits(path, _IMAGE) as hdus:
-            found = [_fits_wcs(hdus, hdu) for hdu in hdus if hdu.is_image]
-        wcs = next((one for one in found if one is not None), None)
+            wcs = _first_wcs(hdus)
     if wcs is None:
         msg = f'{path}: must hold a WCS with celestial axes, got none'
         raise ValueError(msg)
     return wcs
+
+
+def wcs_alone(path):
+    """Return the WCS of a file that has no image, None for all others."""
+    if is_asdf(path):
+        tree = read_asdf_tree(path)
+        return None if _branch_with_data(tree) else find_gwcs(tree)
+    with open_fits(path, _IMAGE) as hdus:
+        alone = not any(hdu.header.get('NAXIS', 0) for hdu in hdus)
+        return _first_wcs(hdus) if alone else None
+
+
+def _first_wcs(hdus):
+    found = (_fits_wcs(hdus, hdu) for hdu in hdus if hdu.is_image)
+    return next((one for one in found if one is not None), None)
 
 
 def read_asdf_tree(path):

@@ -1,9 +1,14 @@
-"""Tables of stars, in any format that astropy reads."""
+"""Tables of stars, in any format that astropy or this package reads."""
 import json
 from pathlib import Path
 
+from astropy.io.registry import IORegistryError
+from astropy.table import QTable
+
 from photutils_mgauss.files.damage import undamaged
 from photutils_mgauss.files.fits_files import open_fits
+from photutils_mgauss.files.list_kinds import program_of_list
+from photutils_mgauss.files.star_lists import read_star_list
 
 __all__ = ['read_table']
 
@@ -23,13 +28,15 @@ def read_table(path):
     Parameters
     ----------
     path : str or path-like
-        An ECSV, FITS, VOTable or any other file that astropy recognises.
+        An ECSV, FITS, VOTable or any other file that astropy recognises, or
+        a star list of another program, see `program_of_list`.
 
     Returns
     -------
     table : `~astropy.table.QTable`
     record : dict
-        Empty for tables of other programs.
+        Empty for tables of other programs. What was made of a star list is
+        in the ``meta`` of its table.
 
     Raises
     ------
@@ -38,26 +45,17 @@ def read_table(path):
     ValueError
         If it is damaged or no table.
     """
-    from astropy.io.registry import IORegistryError
-    from astropy.table import QTable
+    program = program_of_list(path)
+    if program is not None:
+        return read_star_list(path, program), {}
     what = 'a table that astropy can read'
     with undamaged(path, what):
         if is_fits(path):
             # Checks the sizes that the headers tell of.
-            with open_fits(path, what) as hdus:
-                _refuse_ldac(hdus)
+            with open_fits(path, what):
                 table = QTable.read(path)
         else:
-            try:
-                table = QTable.read(path)
-            except IORegistryError as error:
-                # Its own words are followed by all formats there are.
-                msg = ('a file of none of the kinds that it recognises; '
-                       'images and PSFs are FITS or ASDF files, and lists of '
-                       "other programs are read in Python with QTable.read("
-                       "file, format='mgauss.daophot'), or the like, and "
-                       'written as ECSV')
-                raise OSError(msg) from error
+            table = _read_text(path)
         text = table.meta.get('MGRUN')
         record = (table.meta.get('mgauss', {}) if text is None
                   else json.loads(text))
@@ -67,11 +65,14 @@ def read_table(path):
     return table, record
 
 
-def _refuse_ldac(hdus):
-    """Raise if the first table is the header of an image, as in LDAC files."""
-    if any(hdu.name == 'LDAC_IMHEAD' for hdu in hdus):
-        msg = ('a catalogue of SExtractor in the format LDAC, which begins '
-               'with the header of the image: in Python, read it with '
-               "QTable.read(file, format='mgauss.sextractor'), and write it "
-               'as ECSV')
-        raise OSError(msg)
+def _read_text(path):
+    try:
+        return QTable.read(path)
+    except IORegistryError as error:
+        # Its own words are followed by all formats there are.
+        msg = ('a file of none of the kinds that it recognises, nor a star '
+               'list of DAOPHOT, DOLPHOT, hst1pass, SExtractor or '
+               'StarFinder; images and PSFs are FITS or ASDF files, and '
+               'other tables are read in Python with QTable.read(file, '
+               'format=...) and written as ECSV')
+        raise OSError(msg) from error

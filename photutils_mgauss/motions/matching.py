@@ -162,15 +162,16 @@ def _is_by_id(detections, on_sky, how, unit):
         msg = "epochs must all have a column 'id' to be matched by it"
         raise ValueError(msg)
     if how.by == 'sky' and not on_sky and how.radius is None:
-        msg = ('match_radius must be given to match epochs without a WCS '
-               'by position')
+        msg = ('match_radius (--match-radius) must be given to match epochs '
+               'without a WCS by position')
         raise ValueError(msg)
     if how.by != 'auto':
         return how.by == 'id'
     if not on_sky:
         if not have and how.radius is None:
             msg = ("epochs without a WCS must have a column 'id', or "
-                   'match_radius must be given')
+                   'match_radius (--match-radius) must be given, or '
+                   "match_by='pattern' (--match-by pattern)")
             raise ValueError(msg)
         return have
     return have and _same_objects(detections, how.tolerance(unit))

@@ -1,9 +1,21 @@
 """What ``mgauss info`` says of files, and what dry runs leave undone."""
+import asdf
+import gwcs
 import numpy as np
 import pytest
+from astropy.coordinates import ICRS
 from astropy.io import fits
+from astropy.modeling.models import (
+    Pix2Sky_TAN,
+    RotateNative2Celestial,
+    Scale,
+    Shift,
+)
 from astropy.table import QTable
+from astropy.wcs import WCS
+from gwcs import coordinate_frames
 
+from helpers import star_list_files
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF
 from photutils_mgauss.cli import main
 
@@ -51,10 +63,10 @@ def test_info_says_that_a_text_is_none_of_the_files(folder, capsys):
     assert main(['info', 'notes.md']) == 1
     assert capsys.readouterr().err.strip() == (
         'mgauss: notes.md: must be a table that astropy can read, got a file '
-        'of none of the kinds that it recognises; images and PSFs are FITS '
-        'or ASDF files, and lists of other programs are read in Python with '
-        "QTable.read(file, format='mgauss.daophot'), or the like, and written "
-        'as ECSV')
+        'of none of the kinds that it recognises, nor a star list of '
+        'DAOPHOT, DOLPHOT, hst1pass, SExtractor or StarFinder; images and '
+        'PSFs are FITS or ASDF files, and other tables are read in Python '
+        'with QTable.read(file, format=...) and written as ECSV')
 
 
 def test_info_goes_on_after_files_that_are_none_of_its_kinds(folder, capsys):
@@ -95,16 +107,71 @@ def test_info_reads_models_of_psfex_before_it_calls_them_so(folder, capsys):
     assert 'undamaged PSFEx model' in capsys.readouterr().err
 
 
-def test_the_header_in_a_catalogue_of_sextractor_is_no_table_of_stars(
-        folder, capsys):
-    head = fits.BinTableHDU.from_columns([fits.Column(
-        'Field Header Card', '80A', array=['SIMPLE = T'])],
-        name='LDAC_IMHEAD')
-    objects = fits.BinTableHDU.from_columns([fits.Column(
-        'X_IMAGE', 'E', array=[3.0])], name='LDAC_OBJECTS')
-    fits.HDUList([fits.PrimaryHDU(), head, objects]).writeto('ldac.fits')
-    assert main(['info', 'ldac.fits']) == 1
-    assert "format='mgauss.sextractor'" in capsys.readouterr().err
+def test_info_says_whose_star_list_a_file_is(folder, capsys):
+    for name, (_, write) in star_list_files.FILES.items():
+        write(folder / name)
+    assert main(['info', *star_list_files.FILES]) == 0
+    said = capsys.readouterr().out
+    for name, program in (('phot', 'DOLPHOT'), ('two.als', 'DAOPHOT'),
+                          ('image_flc.xymq', 'hst1pass'),
+                          ('keck.lis', 'StarFinder'),
+                          ('stars.ldac', 'SExtractor')):
+        assert f'{name}: a star list of {program}, 2 stars' in said
+    assert 'the centre of the first pixel is (0, 0); DOLPHOT calls it' in said
+    assert 'photon noise of a star whose FWHM is 2 pix' in said
+    assert said.count('mgauss motions with --wcs or --plane and --time') == 8
+    assert 'of its image: no WCS, time unknown' in said
+
+
+def write_grids(cube):
+    """Write a STDPSF file of two chips, a grid of STPSF and an ePSF."""
+    header = fits.Header({'NXPSFS': 2, 'NYPSFS': 4})
+    header.update({f'IPSFX{i + 1:02d}': x for i, x in enumerate((1, 2048))})
+    header.update({f'JPSFY{i + 1:02d}': y
+                   for i, y in enumerate((1, 2048, 2049, 4096))})
+    fits.writeto('std.fits', cube, header)
+    header = fits.Header({'OVERSAMP': 5, 'DET_SAMP': 5, 'FOVPIXEL': 5})
+    header.update({f'DET_YX{i}': f'({y}, {x})' for i, (x, y) in enumerate(
+        ((0, 0), (900, 0), (0, 500), (900, 500)))})
+    fits.writeto('st.fits', cube[:4], header)
+    fits.writeto('epsf.fits', cube[0], fits.Header({'OVERSAMP': 3}))
+
+
+def test_info_says_what_is_in_psfs_of_other_programs(folder, capsys):
+    write_grids(np.ones((8, 25, 25)))
+    assert main(['info', 'std.fits', 'st.fits', 'epsf.fits']) == 0
+    said = capsys.readouterr().out
+    nodes = '2 x 2 nodes, x 0 to 2047, y 0 to 2047; images of 25 x 25'
+    assert f'  detector 1: {nodes} samples, 4 to a pixel\n' in said
+    assert f'  detector 2: {nodes} samples, 4 to a pixel\n' in said
+    assert '  2 PSFs: choose one with --detector\n' in said
+    assert ('  extension 0: 2 x 2 nodes, x 0 to 900, y 0 to 500; images of '
+            '25 x 25 samples, 5 to a pixel\n') in said
+    assert '  extension 0: an image of 25 x 25 samples, 3 to a pixel' in said
+    assert main(['info', 'std.fits', '--detector', '2']) == 0
+    assert 'detector 1' not in capsys.readouterr().out
+    assert main(['info', 'std.fits', '--detector', '3']) == 1
+
+
+def test_info_says_what_a_wcs_alone_is(folder, capsys):
+    frames = [(coordinate_frames.Frame2D(name='detector'),
+               Shift(-10) & Shift(-20) | Scale(1e-5) & Scale(1e-5)
+               | Pix2Sky_TAN() | RotateNative2Celestial(83, -5, 180)),
+              (coordinate_frames.CelestialFrame(
+                  name='sky', reference_frame=ICRS()), None)]
+    asdf.AsdfFile({'wcs': gwcs.WCS(frames)}).write_to('wcs.asdf')
+    asdf.AsdfFile({'words': 'none'}).write_to('words.asdf')
+    plain = WCS(naxis=2)
+    plain.wcs.crpix, plain.wcs.crval = (11, 21), (83, -5)
+    plain.wcs.cdelt, plain.wcs.ctype = (-1e-5, 1e-5), ('RA---TAN', 'DEC--TAN')
+    fits.PrimaryHDU(header=plain.to_header()).writeto('wcs.fits')
+    assert main(['info', 'wcs.asdf', 'wcs.fits']) == 0
+    said = capsys.readouterr().out
+    for name, kind in (('wcs.asdf', 'a gwcs'), ('wcs.fits', 'a FITS WCS')):
+        assert (f'{name}: a WCS without an image\n  {kind} of an image of '
+                'unknown size; pixel (0, 0) is at ra 8') in said
+    assert main(['info', 'words.asdf']) == 1
+    assert "2 dimensions called 'data'" in capsys.readouterr().err
 
 
 def test_without_a_command_there_is_help(capsys):
