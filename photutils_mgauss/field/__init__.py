@@ -4,7 +4,7 @@
 cut them out, and `stages` fits fields of rising degree and drops stars that do
 not fit; `normal` adds up the normal equations and `forms` has the kinds of
 field they are for. `choice` validates numbers of Gaussians and degrees with
-stars left out of the fit, and `beyond` adds one more degree when there are few
+stars left out of the fit, and `beyond` adds further degrees when there are few
 stars. `covariance`, `noise` and `misfit` give the errors of the field, and
 `growth` measures the light beyond the stamps. The results are `mixture_field`,
 `tuned_field` and `empirical`, a PSF of pixels, all on `base`. A field gives a

@@ -8,12 +8,12 @@ are fitted, those that few stars do not tell with the variances they are
 likely to have, which makes them part of the covariance. The terms of degree d
 have the variance :math:`4^{1 - d} e^{l + h} S`, with S that of the terms of
 degree 1, which becomes :math:`e^l S` itself; h is 0 where coefficients halve
-with each degree. Log weights, means and precisions have an l and an h each.
+with each degree. Log weights, means along x, means along y, and precisions
+have an l and an h each: optics may move the light along one axis only.
 
 With :math:`M, b` the normal equations at coefficients c, :math:`\Lambda` the
-precisions of the prior, and :math:`r = b - \Lambda c`, those l and h are
-taken under which the stars are most likely, all coefficients together, and
-which are themselves not unlikely:
+precisions of the prior, and :math:`r = b - \Lambda c`, the likelihood L of
+all l and h, for any coefficients, is
 
 .. math::
 
@@ -26,6 +26,16 @@ variance v under all this,
 .. math::
 
     2 \frac{\partial \ln L}{\partial \ln v} = \frac{m^2 + s^2}{v} - 1 .
+
+Few stars leave l and h uncertain, and what they cannot tell may be as large
+as the mean of its variances, which is more than the most likely one. About
+the most likely sizes :math:`\hat\sigma` their distribution is nearly a
+Gaussian of covariance C, and a variance :math:`e^{a^T \sigma}` has the mean
+
+.. math::
+
+    \left\langle e^{a^T \sigma} \right\rangle
+    = e^{a^T \hat\sigma + a^T C a / 2} .
 """
 from dataclasses import replace
 
@@ -47,9 +57,21 @@ from photutils_mgauss.field.normal import (
 _ROUNDS = 2
 # By how much variances fall with each degree.
 _FALL = 0.25
+# Which l and h each of a Gaussian's numbers has.
+_KINDS = np.array([0, 1, 2, 3, 3, 3])
+_N_KINDS = 4
+# What l and h there are in the logs of known and of new variances.
+_USES = np.kron([[1, 0], [1, 1]], np.eye(_N_KINDS))
 # Standard deviations of l and h. Those h that simulated optics have with
-# hundreds of stars scatter by 0.7 about 0; others may differ more.
-_WIDTHS = np.repeat([2.0, 1.0], 3)
+# hundreds of stars scatter by 0.7 about 0; others may differ more. Most of
+# the variance is common to means along x and y, whose l and h differ less
+# from each other than from 0.
+_WIDTHS, _COMMON = (2.0, 1.0), 0.8
+_ALIKE = np.eye(_N_KINDS)
+_ALIKE[1, 2] = _ALIKE[2, 1] = _COMMON
+_PRECISION = np.linalg.inv(np.kron(np.diag(np.square(_WIDTHS)), _ALIKE))
+# Of numerical derivatives by l and h.
+_STEP = 0.1
 _LIMITS = (-9.0, 3.0)
 _TOLERANCE, _MOST_STEPS = 0.1, 100
 
@@ -101,7 +123,7 @@ def _wider(fit, basis, degree, used, workers, reject):
     for i in range(_ROUNDS):
         stages.weigh(wide, reject=reject and i > 0, share=None)
         wide.equations = equations(wide.problem, wide.coefficients, workers)
-        wide.prior = sizes.most_likely()
+        wide.prior = sizes.expected()
         stages.advance(wide, workers, tolerance=0.01, max_steps=10)
     return wide
 
@@ -115,7 +137,7 @@ def _raised(prior, terms):
 
 class _Sizes:
     """
-    The sizes l and h of a fit's terms.
+    The sizes l and h of a fit's terms, how large these may be.
 
     Those of a slice are new; ``scale`` (P,) are the variances S.
     """
@@ -123,7 +145,6 @@ class _Sizes:
     def __init__(self, fit, new, scale):
         self.fit = fit
         self.known, self.new = slice(1, new.start), new
-        self.kinds = fit.problem.form.kinds
         self.precision = fit.prior.precision.copy()
         variance = np.ones(self.precision[0].size)
         # The first three numbers are not fitted.
@@ -132,32 +153,48 @@ class _Sizes:
         self.precision[new] = 1 / (variance.reshape(self.precision[0].shape)
                                    * fall[:, None, None])
 
-    def most_likely(self):
-        """Return the prior under which the stars are most likely."""
-        found = minimize(self._cost, np.zeros(_WIDTHS.size), jac=True,
+    def expected(self):
+        """Return the prior of the variances that are to be expected."""
+        found = minimize(self._cost, np.zeros(len(_USES)), jac=True,
                          method='L-BFGS-B',
-                         bounds=[_LIMITS] * _WIDTHS.size,
+                         bounds=[_LIMITS] * len(_USES),
                          options={'maxiter': _MOST_STEPS,
                                   'gtol': _TOLERANCE})
-        return self.prior(found.x)
+        return self.prior(found.x, self._covariance(found.x))
 
-    def prior(self, sizes):
-        """Return the prior for the l and the h (6,) by kind."""
-        every, higher = sizes.reshape(2, -1)[:, self.kinds]
+    def _covariance(self, sizes):
+        """Return the covariance of the sizes about the most likely ones."""
+        here = self._cost(sizes)[1]
+        curvature = np.array([self._cost(sizes + step)[1] - here for step in
+                              _STEP * np.eye(sizes.size)]) / _STEP
+        values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
+        # Far from a maximum it may be anything; the prior knows that much.
+        values = np.maximum(values, np.linalg.eigvalsh(_PRECISION)[0])
+        return (vectors / values) @ vectors.T
+
+    def prior(self, sizes, covariance=None):
+        """
+        Return the prior for the l (4,) and then the h (4,) of the kinds.
+
+        With a covariance (8, 8) of theirs, of the means of the variances.
+        """
+        logs = _USES @ sizes
+        if covariance is not None:
+            logs = logs + 0.5 * np.diag(_USES @ covariance @ _USES.T)
+        known, new = logs.reshape(2, -1)[:, _KINDS]
         precision = self.precision.copy()
-        precision[self.known] *= np.exp(-every)
-        precision[self.new] *= np.exp(-every - higher)
+        precision[self.known] *= np.exp(-known)
+        precision[self.new] *= np.exp(-new)
         return replace(self.fit.prior, precision=precision)
 
     def _cost(self, sizes):
         """Return less the log likelihood, and its derivatives."""
         value, slopes = evidence(self.fit, self.prior(sizes))
-        known, new = ([slopes[terms][..., self.kinds == kind].sum()
-                       for kind in range(3)]
-                      for terms in (self.known, self.new))
-        slope = np.append(np.add(known, new), new)
-        pulls = sizes / _WIDTHS
-        return 0.5 * pulls @ pulls - value, pulls / _WIDTHS - slope
+        by_log = [slopes[terms][..., kind == _KINDS].sum()
+                  for terms in (self.known, self.new)
+                  for kind in range(_N_KINDS)]
+        pull = _PRECISION @ sizes
+        return 0.5 * sizes @ pull - value, pull - by_log @ _USES
 
 
 def evidence(fit, prior):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from numpy.testing import assert_allclose
+from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
 from photutils_mgauss import (
@@ -12,8 +13,8 @@ from photutils_mgauss import (
     MixturePSFPhotometry,
     fit_mixture_field,
 )
-from photutils_mgauss.field.beyond import evidence
-from photutils_mgauss.field.normal import Prior
+from photutils_mgauss.field.beyond import _Sizes, evidence
+from photutils_mgauss.field.normal import Prior, to_vector
 from photutils_mgauss.field.stages import polynomials, term_degrees
 
 SIZE, FLUX = 160, 3e4
@@ -55,6 +56,48 @@ def test_derivatives_by_variances_are_those_of_the_likelihood(linear):
     expected = [(likelihood(logs + step)[0] - likelihood(logs - step)[0])
                 / 2e-4 for step in steps]
     assert_allclose(likelihood(logs)[1].ravel(), expected, rtol=1e-6)
+
+
+@pytest.fixture
+def sizes():
+    """Return a fit of linear data, six terms of three Gaussians' numbers."""
+    rng = np.random.default_rng(8)
+    shape, n = (6, 3, 6), 6 * (3 * 6 - 3)
+    design = rng.normal(size=(60, n))
+    stddev = np.tile([0.3, 2.0, 0.2, 0.5, 0.5, 0.5], (6, 3, 1))
+    stddev[3:] /= 2
+    vector = to_vector(stddev * rng.normal(size=shape))
+    data = design @ vector + rng.normal(size=60)
+    fit = SimpleNamespace(
+        coefficients=np.zeros(shape), equations=SimpleNamespace(
+            matrix=design.T @ design, right=design.T @ data),
+        prior=Prior(np.zeros(shape), np.ones(shape)))
+    return _Sizes(fit, slice(3, 6), np.ones(3 * 6 - 3))
+
+
+def test_variances_are_those_to_be_expected(sizes):
+    rng = np.random.default_rng(5)
+    found = sizes.expected()
+    # The mean over sizes drawn about the most likely ones, each as often as
+    # the stars make it likely.
+    middle = minimize(sizes._cost, np.zeros(8), jac=True).x
+    root = np.linalg.cholesky(1.5 * sizes._covariance(middle))
+    normal = rng.normal(size=(1500, 8))
+    drawn = middle + normal @ root.T
+    logs = 0.5 * (normal**2).sum(axis=1) - [sizes._cost(x)[0] for x in drawn]
+    share = np.exp(logs - logs.max())
+    expected = np.average([1 / sizes.prior(x).precision for x in drawn],
+                          weights=share, axis=0)
+    fitted = np.s_[1:, 1:]
+    assert_allclose(np.log(1 / found.precision[fitted]),
+                    np.log(expected[fitted]), atol=0.25)
+    most_likely = 1 / sizes.prior(middle).precision
+    assert np.all(expected[fitted] > 1.05 * most_likely[fitted])
+
+
+def test_means_along_either_axis_vary_by_amounts_of_their_own(sizes):
+    along_x, along_y = 1 / sizes.expected().precision[1, 1, 1:3]
+    assert along_x > 3 * along_y
 
 
 def smooth_gaussian(rng):
