@@ -5,9 +5,9 @@ Positions with a PSF field from 150 stars, against the Cramer-Rao bound.
         [--stars 150] [--n-components 6] [--degree 4]
         [--peers psfex,empirical,epsf] [--time]
     python tests/benchmarks/bench_field.py --harness DIR --variants
-        SCENE [SCENE ...]
+        SCENE [SCENE ...] [--bound]
     python tests/benchmarks/bench_field.py --harness DIR --undersampled
-        TABLE [TABLE ...] [--seed 5] [--stars 150]
+        TABLE [TABLE ...] [--seed 5] [--stars 150] [--bound]
     python tests/benchmarks/bench_field.py --decam DIR
 
 A scene is a folder with sci.fits, mask.fits, vartrue.fits, truth.ecsv and
@@ -30,6 +30,10 @@ cosmic rays, and for 150 stars of each other scene (steep, aberrated, ...).
 of the harness) and prints a line for each: stars of 18 to 20 mag are fitted
 with the field of other stars and with the true PSF, and stars without
 noise at 64 places in a pixel say how fluxes and positions change with that.
+
+--bound adds what no field of as many Gaussians and this degree from these
+stars can go below (field_bound.py), to lines of --undersampled and to those
+of --variants with 150 stars.
 
 --decam needs the folder with 117 stars of a DECam chip (decam_psfex) and
 psfex on the path, which models the same three quarters of the stars; the last
@@ -58,6 +62,7 @@ from photutils_mgauss import (
 )
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+from field_bound import Bound
 from undersampled import print_camera
 
 from helpers.decam_chip import (
@@ -68,7 +73,8 @@ from helpers.decam_chip import (
 )
 
 EDGES = np.arange(18, 27)
-RADIUS = 10
+# Of stamps, and how far the light of stars is drawn [pix].
+RADIUS, FAR = 10, 40
 
 
 def scatter(values):
@@ -224,15 +230,31 @@ def run_variant(label, path, options, n_stars, n_rays=0):
     best, mine = (errors_in_bounds(meta, truth_psf, images, test, one)[0]
                   for one in fits)
     mag = np.floor(np.asarray(test['mag']))
-    ratios = [np.sqrt(np.mean(mine[mag == low]**2)
-                      / np.mean(best[mag == low]**2)) for low in range(18, 22)]
+
+    def ratios(errors):
+        return [np.sqrt(np.mean(errors[mag == low]**2)
+                        / np.mean(best[mag == low]**2))
+                for low in range(18, 22)]
     bias = np.median((fits[1][:, 2] / np.asarray(test['flux']))[mag < 20]) - 1
     print(f'{label:24s} K={field.n_components} degree={field.degree} '
-          + ' '.join(f'{ratio:.3f}' for ratio in ratios)
-          + f'  mean {np.mean(ratios):.3f}  worst '
+          + ' '.join(f'{ratio:.3f}' for ratio in ratios(mine))
+          + f'  mean {np.mean(ratios(mine)):.3f}  worst '
           f'{1000 * np.abs(mine[mag < 20]).max():.0f} mpix  '
           f'flux {100 * bias:+.2f} % +- {100 * field.wing_error:.2f}  '
           f'{cpu:.0f} s CPU', flush=True)
+    if options.bound and n_stars >= 150 and not n_rays:
+        def offsets(psf, image):
+            fitted = fit_with_field(psf.to_grid((30, 30)), image,
+                                    np.sqrt(variance), test)
+            return errors_in_bounds(meta, truth_psf, images, test, fitted)[0]
+        clean = np.zeros(data.shape)
+        truth_psf.render(clean, *(np.asarray(truth[name]) for name in (
+            'x', 'y', 'flux')), FAR, meta['origin'])
+        every = truth['x', 'y', 'flux']
+        every['selected'] = np.isin(truth['x'], test['x'])
+        found = Bound(field, clean, np.sqrt(variance), stars, every, offsets)
+        print('    ' + found.report(
+            best, lambda errors: np.mean(ratios(errors))), flush=True)
 
 
 def print_variants(options):
@@ -478,6 +500,7 @@ def main():
     parser.add_argument('--variants', action='store_true')
     parser.add_argument('--undersampled', nargs='+', default=[])
     parser.add_argument('--seed', type=int, default=5)
+    parser.add_argument('--bound', action='store_true')
     parser.add_argument('--time', action='store_true')
     options = parser.parse_args()
     if options.decam:
@@ -490,7 +513,9 @@ def main():
     for name in options.undersampled:
         from csst_psf import TruePSF
         print_camera(name, TruePSF(name), fit_with_truth, options.seed,
-                     options.stars)
+                     options.stars, bound=options.bound,
+                     n_components=options.n_components,
+                     degree=options.degree)
     if not options.scenes:
         return
     if options.variants:

@@ -3,7 +3,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from astropy.table import QTable
+from astropy.table import QTable, vstack
+from field_bound import Bound
 
 from photutils_mgauss import MixturePSFPhotometry, fit_mixture_field
 
@@ -82,19 +83,28 @@ def phase_errors(field, truth_psf):
     return flux, np.sqrt(np.mean(np.square(sides)))
 
 
-def print_camera(name, truth_psf, fit_with_truth, seed, n_psf):
-    """Print a line on a camera whose true PSF is known."""
+def print_camera(name, truth_psf, fit_with_truth, seed, n_psf, *,
+                 bound=False, **how):
+    """
+    Print a line on a camera whose true PSF is known.
+
+    With ``bound`` another one: what no fit can go below. ``how`` are options
+    of the fit.
+    """
     data, error, stars, test = scene(truth_psf, seed, n_psf)
     start = time.process_time()
     field = fit_mixture_field(data, stars['x', 'y'], error=error,
-                              radius=RADIUS)
+                              radius=RADIUS, **how)
     seconds = time.process_time() - start
     table = measured(field.to_grid((12, 12)), data, error, test)
     best = fit_with_truth(truth_psf, {'origin': (0, 0)}, data, error**2, test)
     x, y = np.asarray(test['x']), np.asarray(test['y'])
-    mine, ideal = (corrected(x, y, np.column_stack(columns) - np.column_stack(
-        [x, y])) for columns in ((table['x_fit'], table['y_fit']),
-                                 best[:, :2].T))
+
+    def off(*places):
+        return corrected(x, y, np.column_stack(places) - np.column_stack(
+            [x, y]))
+    mine = off(table['x_fit'], table['y_fit'])
+    ideal = off(*best[:, :2].T)
     errors = np.column_stack([table['x_err'], table['y_err']])
     flux = np.asarray(table['flux_fit'] / test['flux'])
     pull = (flux - np.median(flux)) * test['flux'] / table['flux_err']
@@ -105,3 +115,13 @@ def print_camera(name, truth_psf, fit_with_truth, seed, n_psf):
           f"PSF's; pulls of x, y {scatter(mine / errors):.2f}, of flux "
           f'{scatter(pull):.2f}; with phase: flux {phase_flux:.3%}, x, y '
           f'{1e3 * phase_place:.2f} mpix; {seconds:.0f} s CPU', flush=True)
+    if bound:
+        def offsets(field, image):
+            table = measured(field.to_grid((12, 12)), image, error, test)
+            return off(table['x_fit'], table['y_fit'])
+        clean = error**2 - SKY - READ_NOISE**2
+        found = Bound(field, clean, error, stars['x', 'y'],
+                      vstack([stars, test])['x', 'y'], offsets)
+        print('    ' + found.report(
+            ideal, lambda errors: scatter(errors) / scatter(ideal)),
+            flush=True)
