@@ -147,13 +147,18 @@ def _rows(rows):
 
 
 def _figure(title, panel):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    figure = Figure(figsize=(5.2, 4.2), layout='constrained')
+    figure = Figure(figsize=(5.2, 4.2), dpi=120, layout='constrained')
     panel.draw(figure.subplots())
-    # How wide the numbers beside colour bars are is known once they are drawn.
+    # How wide the numbers beside colour bars are is known once they are drawn:
+    # only then are they laid out, once.
+    layout = figure.get_layout_engine()
+    figure.set_layout_engine('none')
     figure.draw_without_rendering()
+    figure.set_layout_engine(layout)
     picture = BytesIO()
-    figure.savefig(picture, format='png', dpi=120)
+    FigureCanvasAgg(figure).print_png(picture)
     data = b64encode(picture.getvalue()).decode()
     return (f'<figure><img alt="{escape(title)}: {escape(panel.caption)}" '
             f'src="data:image/png;base64,{data}"><figcaption>'

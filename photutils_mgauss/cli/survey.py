@@ -203,10 +203,8 @@ def _run(options, survey):
     workers = (local_workers(options.workers) if options.cluster is None
                else cluster_workers(options.cluster))
     mark_output(survey)
-    try:
+    with workers:
         steps = _all_steps(options, survey, workers)
-    finally:
-        workers.close()
     _finish(options, survey, *steps, time.perf_counter() - start)
     if any(outcome.error for some in steps for outcome in some.values()):
         msg = (f'{survey.output / "index.html"} lists what failed; the rest '

@@ -172,10 +172,10 @@ class Inline:
         """Do nothing: there is nobody to send home."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Workers:
     """
-    Where tasks run.
+    Where tasks run, step after step.
 
     Attributes
     ----------
@@ -184,13 +184,34 @@ class Workers:
         broke.
     number : int
         How many of them there are.
-    close : callable, optional
+    end : callable, optional
         Called when all is done.
     """
 
     make: object
     number: int
-    close: object = lambda: None
+    end: object = lambda: None
+    idle: list = field(default_factory=list)
+
+    def lend(self, most):
+        """
+        Return executors, at most so many.
+
+        Those that have worked come first: a process takes seconds to import
+        what it works with.
+        """
+        number = min(self.number, most)
+        lent = [self.idle.pop() for _ in range(min(number, len(self.idle)))]
+        return lent + [self.make() for _ in range(number - len(lent))]
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        for executor in self.idle:
+            executor.shutdown(wait=True)
+        self.idle.clear()
+        self.end()
 
 
 def local_workers(number):
@@ -278,7 +299,7 @@ def run_tasks(tasks, workers, tell):
     """
     done, deaths = {}, {}
     waiting, running = deque(tasks), {}
-    slots = [workers.make() for _ in range(min(workers.number, len(tasks)))]
+    slots = workers.lend(len(tasks))
     free = list(range(len(slots)))
     try:
         while waiting or running:
@@ -298,8 +319,7 @@ def run_tasks(tasks, workers, tell):
                     done[task.name] = outcome
                     tell(outcome)
     finally:
-        for executor in slots:
-            executor.shutdown(wait=True)
+        workers.idle.extend(slots)
     return done
 
 

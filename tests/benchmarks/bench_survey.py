@@ -274,9 +274,9 @@ def one_task(folder, _):
     for some in (tasks[:n // 2], tasks):  # the half is done, and skipped
         times = []
         cpu = time.process_time()
-        survey_run.run_tasks(some, survey_run.local_workers(2),
-                             lambda _, times=times: times.append(
-                                 time.perf_counter()))
+        with survey_run.local_workers(2) as workers:
+            survey_run.run_tasks(some, workers, lambda _, times=times:
+                                 times.append(time.perf_counter()))
         # Until the first one comes back, processes start.
         print(f'{len(some)} tasks that do nothing: '
               f'{1e3 * (times[-1] - times[1]) / (len(some) - 2):.1f} ms each,'

@@ -56,8 +56,9 @@ def drive(folder, n, workers=2):
     folder = Path(folder)
     (folder / 'records').mkdir(exist_ok=True)
     survey_run.run_task = noted
-    survey_run.run_tasks(tasks_without_work(folder, n),
-                         survey_run.local_workers(workers), lambda _: None)
+    with survey_run.local_workers(workers) as processes:
+        survey_run.run_tasks(tasks_without_work(folder, n), processes,
+                             lambda _: None)
 
 
 if __name__ == '__main__':

@@ -275,7 +275,8 @@ def test_a_worker_that_dies_loses_nothing(tmp_path, monkeypatch, light):
     monkeypatch.setattr(survey_run, 'run_task', light.kill_once)
     tasks = [make_task(tmp_path, f'task{k}') for k in range(3)]
     told = []
-    done = run_tasks(tasks, local_workers(2), told.append)
+    with local_workers(2) as workers:
+        done = run_tasks(tasks, workers, told.append)
     assert sorted(done) == ['task0', 'task1', 'task2']
     assert not any(outcome.error for outcome in done.values())
     assert len(told) == 3
@@ -324,6 +325,18 @@ def test_what_is_killed_repeats_one_task_each(tmp_path, light):
     assert len(begun) <= n + kills
     # What had a record was not done again.
     assert before == {path: path.stat().st_mtime_ns for path in known}
+
+
+def test_processes_work_on_in_the_next_step(tmp_path, monkeypatch, light):
+    from photutils_mgauss.cli import survey_run
+    monkeypatch.setattr(survey_run, 'run_task', light.noted)
+    (tmp_path / 'records').mkdir()
+    tasks = light.tasks_without_work(tmp_path, 8)
+    with local_workers(2) as workers:
+        for some in (tasks[:4], tasks[4:]):
+            assert len(run_tasks(some, workers, lambda _: None)) == 4
+    assert len(light.notes(tmp_path)) == 8
+    assert len({pid for _, pid in light.notes(tmp_path)}) == 2
 
 
 def test_processes_share_the_cores(monkeypatch):
@@ -381,7 +394,7 @@ def test_results_are_the_same_whoever_makes_them(images, tmp_path, capsys):
     for workers in ('1', '2'):
         path = tmp_path / f'{workers}.toml'
         path.write_text(
-            f'output = "out{workers}"\n[exposures]\nfiles = "{images}/raw/'
+            f'output = "out{workers}"\npages = false\n[exposures]\nfiles = "{images}/raw/'
             f'south*.fits"\n[photometry]\npsf = "psf.fits"\n[motions]\n'
             f'references = "{images}/quasars.ecsv"\n')
         assert main(['survey', str(path), '--workers', workers]) == 0, (
@@ -403,10 +416,9 @@ def test_tasks_run_on_a_dask_cluster(tmp_path, light):
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1,
                                   processes=False,
                                   dashboard_address=None) as cluster:
-        workers = cluster_workers(cluster.scheduler_address)
-        done = run_tasks(tasks, workers, told.append)
-        again = run_tasks(tasks, workers, told.append)
-        workers.close()
+        with cluster_workers(cluster.scheduler_address) as workers:
+            done = run_tasks(tasks, workers, told.append)
+            again = run_tasks(tasks, workers, told.append)
     assert workers.number == 2
     assert not any(one.error or one.skipped for one in done.values())
     assert all(one.skipped for one in again.values())

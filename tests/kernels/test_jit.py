@@ -31,8 +31,9 @@ print(round(float(psf.evaluate(3.0, 4.0, 2 * np.pi, 3.0, 4.0)), 6))
 def copy(tmp_path):
     """Return a copy of the package whose compiled code is its own."""
     folder = tmp_path / 'site' / 'photutils_mgauss'
+    # What Python keeps of its own is as good there.
     shutil.copytree(PACKAGE, folder,
-                    ignore=shutil.ignore_patterns('__pycache__'))
+                    ignore=shutil.ignore_patterns('*.nbi', '*.nbc'))
     return folder
 
 
@@ -65,6 +66,8 @@ def test_an_edit_of_a_function_called_from_another_file_is_noticed(
 
 def test_without_a_folder_for_it_code_is_compiled_and_one_warning_given(
         copy, tmp_path):
+    for place in list(copy.rglob('__pycache__')):
+        shutil.rmtree(place)
     for place in (copy, *(p for p in copy.rglob('*') if p.is_dir())):
         (place / '__pycache__').write_text('')
     wall = tmp_path / 'file'
