@@ -19,10 +19,13 @@ from hashlib import sha256
 from pathlib import Path
 
 from numba import njit, types
+from numba.core import ir
+from numba.core.analysis import compute_cfg_from_blocks, compute_use_defs
 from numba.core.caching import FunctionCache, NullCache
 from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
 from numba.core.compiler_machinery import AnalysisPass, register_pass
-from numba.core.typed_passes import NopythonTypeInference
+from numba.core.lowering import Lower
+from numba.core.typed_passes import NativeLowering, NopythonTypeInference
 from numba.extending import intrinsic
 
 _LOG = logging.getLogger('photutils_mgauss')
@@ -416,6 +419,39 @@ class _LendRawCode(_LendCode):
         library.add_linking_library = remember
 
 
+class _Lower(Lower):
+    """
+    What writes the code of a function for the compiler.
+
+    numba keeps on the stack what is used in more than one block of code, named
+    tuples of arrays too, and puts all of it together again wherever a part is
+    used. What is assigned once needs no place there: half of the code less.
+    """
+
+    def _find_singly_assigned_variable(self):
+        super()._find_singly_assigned_variable()
+        if self.context.enable_nrt:
+            return  # counts of who holds an array are kept on the stack
+        dominators = compute_cfg_from_blocks(self.blocks).dominators()
+        uses = compute_use_defs(self.blocks).usemap
+        homes = {}
+        for offset, block in self.blocks.items():
+            for one in block.find_insts(ir.Assign):
+                homes.setdefault(one.target.name, []).append(offset)
+        self._singly_assigned_vars |= {
+            name for name, home in homes.items() if len(home) == 1 and all(
+                home[0] < offset and home[0] in dominators[offset]
+                for offset, names in uses.items() if name in names)}
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LowerCode(NativeLowering):
+    """numba's own pass with less on the stack."""
+
+    _name = 'lower_code'
+    lowering_class = _Lower
+
+
 class _KernelCompiler(CompilerBase):
     """numba's own pipeline with one pass more and some less."""
 
@@ -429,8 +465,9 @@ class _KernelCompiler(CompilerBase):
     def define_pipelines(self):
         """Return the passes."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.passes = [entry for entry in passes.passes
-                         if entry[0].__name__ not in _NOT_NEEDED]
+        passes.passes = [
+            (_LowerCode if one is NativeLowering else one, *rest)
+            for one, *rest in passes.passes if one.__name__ not in _NOT_NEEDED]
         passes.add_pass_after(self.prepare, NopythonTypeInference)
         passes.finalize()
         return [passes]
