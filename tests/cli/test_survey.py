@@ -394,8 +394,9 @@ def test_results_are_the_same_whoever_makes_them(images, tmp_path, capsys):
     for workers in ('1', '2'):
         path = tmp_path / f'{workers}.toml'
         path.write_text(
-            f'output = "out{workers}"\npages = false\n[exposures]\nfiles = "{images}/raw/'
-            f'south*.fits"\n[photometry]\npsf = "psf.fits"\n[motions]\n'
+            f'output = "out{workers}"\npages = false\n[exposures]\n'
+            f'files = "{images}/raw/south*.fits"\n[photometry]\n'
+            'psf = "psf.fits"\n[motions]\n'
             f'references = "{images}/quasars.ecsv"\n')
         assert main(['survey', str(path), '--workers', workers]) == 0, (
             capsys.readouterr().err)
@@ -413,12 +414,12 @@ def test_tasks_run_on_a_dask_cluster(tmp_path, light):
     distributed = pytest.importorskip('distributed')
     tasks = light.tasks_without_work(tmp_path, 6)
     told = []
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1,
-                                  processes=False,
-                                  dashboard_address=None) as cluster:
-        with cluster_workers(cluster.scheduler_address) as workers:
-            done = run_tasks(tasks, workers, told.append)
-            again = run_tasks(tasks, workers, told.append)
+    with (distributed.LocalCluster(n_workers=1, threads_per_worker=1,
+                                   processes=False,
+                                   dashboard_address=None) as cluster,
+          cluster_workers(cluster.scheduler_address) as workers):
+        done = run_tasks(tasks, workers, told.append)
+        again = run_tasks(tasks, workers, told.append)
     assert workers.number == 2
     assert not any(one.error or one.skipped for one in done.values())
     assert all(one.skipped for one in again.values())
