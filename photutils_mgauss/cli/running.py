@@ -10,10 +10,12 @@ import signal
 import sys
 import warnings
 from contextlib import contextmanager, suppress
+from functools import partial
 
 from tqdm import tqdm
 
 from photutils_mgauss.cli import tools
+from photutils_mgauss.cli.warned import Warned
 from photutils_mgauss.utils.parallel import Threads
 
 _INTERRUPTED = 130
@@ -43,10 +45,10 @@ def run_command(options, words, *, is_process):
     int
         The exit code.
     """
-    with _warnings_shown():
+    with _warnings_shown() as warned:
         try:
             with _log_file(options.log_file, words):
-                return _run(options, is_process)
+                return _run(options, warned, is_process)
         except OSError as error:
             complain(tools.sentence_of(error))
             return 1
@@ -54,17 +56,10 @@ def run_command(options, words, *, is_process):
 
 @contextmanager
 def _warnings_shown():
-    """Show each warning as a line, and only once."""
+    """Show each kind of warning as a line, once for each file."""
     from astropy import log
     from astropy.logger import LoggingError
-    known = set()
-
-    def show(message, *_, **__):
-        words = tools.one_line(str(message))
-        if words not in known:
-            known.add(words)
-            _warn(words)
-
+    warned = Warned(_warn, partial(tools.LOG.warning, '%s'))
     # Or astropy would show its own.
     was_logged = log.warnings_logging_enabled()
     with suppress(LoggingError):
@@ -72,22 +67,26 @@ def _warnings_shown():
     try:
         with warnings.catch_warnings():
             if not sys.warnoptions:
-                warnings.simplefilter('default')
+                # Python would take those of two files for one.
+                warnings.simplefilter('always')
                 # What only programmers can do something about.
                 for kind in (ResourceWarning, DeprecationWarning,
                              PendingDeprecationWarning, FutureWarning):
                     warnings.simplefilter('ignore', kind)
-            warnings.showwarning = show
-            yield
+            warnings.showwarning = warned.show
+            yield warned
     finally:
         if was_logged and not log.warnings_logging_enabled():
             log.enable_warnings_logging()
 
 
-def _run(options, is_process):
+def _run(options, warned, is_process):
     """Return the exit code of a command; say what went wrong with it."""
     try:
-        (_run_apart if is_process else options.run)(options)
+        try:
+            (_run_apart if is_process else options.run)(options)
+        finally:
+            warned.end()
     except _TerminatedError:
         complain('terminated')
         return _TERMINATED

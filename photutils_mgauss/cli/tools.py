@@ -27,9 +27,12 @@ _LONGEST = 500
 _WORDED = (OSError, ValueError, TypeError, RuntimeError)
 # Files that are being written.
 _DRAFTS = set()
-
+# Files that the command is at work on, the innermost last.
+_SUBJECTS = []
 
 LOG = logging.getLogger('mgauss')
+# Or errors would be printed a second time where there is no log file.
+LOG.addHandler(logging.NullHandler())
 
 
 def command(commands, name, words, description, example, run):
@@ -196,7 +199,8 @@ def sentence_of(error):
 
 @contextmanager
 def about(path):
-    """Have whatever goes wrong inside name the file that it is about."""
+    """Have errors and warnings inside name the file that they are about."""
+    _SUBJECTS.append(str(path))
     try:
         yield
     except Exception as error:
@@ -206,6 +210,13 @@ def about(path):
         # Readers raise what they please.
         msg = f'{path}: {words}'
         raise ValueError(msg) from error
+    finally:
+        _SUBJECTS.pop()
+
+
+def subject():
+    """Return the file that the command is at work on, or None."""
+    return _SUBJECTS[-1] if _SUBJECTS else None
 
 
 def say(options, *lines):

@@ -93,10 +93,16 @@ def _report(done, options, stacklevel):
     # Undetected companions broaden stars: look at those least broadened.
     width = float(np.percentile(widths, 25)) if len(widths) >= 5 else np.nan
     if abs(width) > _WIDTH_TOLERANCE:
-        word = 'narrow' if width > 0 else 'wide'
+        word, more = 'narrow', ('Where most bright stars are blends, the '
+                                'PSF may be right')
+        if width < 0:
+            word, more = 'wide', ('A PSF that includes the pixel must have '
+                                  'pixel_integrated=False')
         warnings.warn(f'the PSF is too {word}: the variance of the light '
-                      f'of bright stars differs by {width:+.0%}',
-                      AstropyUserWarning, stacklevel=stacklevel)
+                      f'of bright stars differs by {width:+.0%}. Use the '
+                      'PSF of this image: psf_model=None (no --psf) makes '
+                      f'one from its stars. {more}', AstropyUserWarning,
+                      stacklevel=stacklevel)
     elif far > _FAR_OFF and options.find_neighbors:
         warnings.warn(
             f'stars and background do not describe the image, {far:.0%} of '

@@ -506,7 +506,7 @@ def _gain(state, trial, step):
     expected = (2 * np.einsum('ni,ni->n', step, state.gradient)
                 - np.einsum('ni,nij,nj->n', step, state.matrix, step))
     # Of a smaller fall nothing is left after rounding: keep the damping.
-    known = (expected > 1e-9 * state.chi2) & np.isfinite(expected)
+    known = expected > 1e-9 * state.chi2
     return np.divide(state.chi2 - trial.chi2, expected, where=known,
                      out=np.full(len(step), kernels.POOR_GAIN))
 

@@ -360,10 +360,14 @@ def _as_plain(value, name, unit):
 
 
 def _scaled(campaign, solved, errors):
-    """Return errors scaled by the scatter of residuals, star by star."""
+    """
+    Return errors scaled by the scatter of residuals, star by star.
+
+    They are NaN where nothing is left over, as in an image of one value.
+    """
     chi2, dof = chi2_of(campaign, solved)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        scatter = np.where(dof > 0, chi2 / dof, np.nan)
+    scatter = np.divide(chi2, dof, where=(dof > 0) & (chi2 > 0),
+                        out=np.full(len(chi2), np.nan))
     return replace(errors, covariance=errors.covariance * scatter,
                    flux_error=errors.flux_error * np.sqrt(scatter)[:, None])
 

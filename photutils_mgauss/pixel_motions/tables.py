@@ -96,7 +96,8 @@ def chi2_of(campaign, solved):
                 + campaign.joint.fit_sky * shown.sum(axis=1))
         left = state.n_pixels.sum(axis=1) - free
         good = left > 0
-        chi2[group[good]] = state.chi2[good, None]
+        # Where images have no noise rounding makes it less than zero.
+        chi2[group[good]] = np.maximum(state.chi2[good, None], 0)
         dof[group[good]] = left[good, None]
     return chi2, dof
 

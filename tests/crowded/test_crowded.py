@@ -712,7 +712,8 @@ def test_bad_keywords_are_named(keyword, value, error):
 
 
 @pytest.mark.parametrize(('sign', 'factor', 'sentence'), [
-    (-1, 1, 'PSF is too narrow'), (1, 1 / 4, 'do not describe the image')])
+    (-1, 1, 'PSF is too narrow.*Use the PSF of this image'),
+    (1, 1 / 4, 'do not describe the image')])
 def test_an_image_that_stars_do_not_describe_is_said(crowd, sign, factor,
                                                      sentence):
     with pytest.warns(AstropyUserWarning, match=sentence):

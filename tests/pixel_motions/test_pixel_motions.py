@@ -506,6 +506,20 @@ def test_images_without_errors_have_errors_from_their_scatter(rng):
                     rtol=0.2)
 
 
+@pytest.mark.parametrize('level', [0, 5])
+def test_images_without_stars_noise_and_errors_have_no_solution(rng, level):
+    star = truth(30.2, 29.6, (20, 10))
+    images = [replace(image, data=np.full(image.data.shape, float(level)),
+                      error=None)
+              for image in observe(star, 2000.0, YEARS, rng)]
+    # NumPy's warnings are errors here.
+    solution, _ = fit_with_notes(images, star['ra', 'dec'])
+    assert decode_motion_flags(solution.stars['flags'][0])[0].startswith(
+        'no_solution')
+    assert np.isnan(solution.stars['pmra_error'].value).all()
+    assert np.isnan(solution.fluxes['flux_err'].value).all()
+
+
 def test_each_image_may_have_another_kind_of_psf(rng):
     star = truth(30.2, 29.6, (20, 10))
     images = observe(star, 2000.0, YEARS, rng)
