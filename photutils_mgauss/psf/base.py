@@ -1,5 +1,6 @@
 """What both astropy PSF models share: copies, units, class identity."""
 import copy
+from operator import attrgetter
 
 import numpy as np
 from astropy.modeling import Fittable2DModel, Parameter
@@ -29,13 +30,10 @@ class PSFParameter(Parameter):
     # Asked for before astropy's constructor has set it.
     _validator = None
 
-    @property
-    def value(self):
-        """The number, without unit."""
-        return super().value
-
-    @value.setter
+    # astropy reads each parameter several times a call: by its own function.
+    @Parameter.value.setter
     def value(self, value):
+        """Take a number that is checked."""
         if self._validator is not None:
             self._validator(self._model, value)
         Parameter.value.fset(self, value)
@@ -104,7 +102,7 @@ class PSFModel(Fittable2DModel):
     @property
     def has_fixed_shape(self):
         """Whether nothing is free but the flux and the position."""
-        return all(getattr(self, name).fixed for name in self.param_names[3:])
+        return all(one.fixed for one in self._all_parameters()[3:])
 
     @property
     def bounding_box(self):
@@ -112,6 +110,10 @@ class PSFModel(Fittable2DModel):
         dx, dy = self._half_size()
         x_0, y_0 = self.x_0, self.y_0
         return ((y_0 - dy, y_0 + dy), (x_0 - dx, x_0 + dx))
+
+    def _all_parameters(self):
+        """Return a tuple of all Parameters, quickly."""
+        return attrgetter(*self.param_names)(self)
 
     def _array_to_parameters(self):
         # Fits come here with every step, and may step anywhere.
@@ -129,7 +131,7 @@ class PSFModel(Fittable2DModel):
         times the derivatives of the ties.
         """
         # Not has_tied, for which astropy makes a dict of all parameters.
-        if not any(getattr(self, name).tied for name in self.param_names):
+        if not any(one.tied for one in self._all_parameters()):
             return columns
         values = np.array([float(np.squeeze(v)) for v in values])
         free = [i for i, name in enumerate(self.param_names)
@@ -228,7 +230,7 @@ class PSFModel(Fittable2DModel):
 
     def _parameter_table(self):
         """Return the columns of a table of parameters; NaN is no bound."""
-        parameters = [getattr(self, name) for name in self.param_names]
+        parameters = self._all_parameters()
         bounds = np.array([p.bounds for p in parameters], dtype=float)
         return {'name': list(self.param_names),
                 'value': np.array([p.value for p in parameters], float),

@@ -350,7 +350,8 @@ class GaussianMixture(ComparedByValue):
         mean = self.weights @ self.means
         offsets = self.means - mean
         spread = self.covariances + offsets[:, :, None] * offsets[:, None, :]
-        return Moments(mean, np.einsum('k,kij->ij', self.weights, spread))
+        return Moments(mean, (self.weights @ spread.reshape(-1, 4)
+                              ).reshape(2, 2))
 
     def encircled_energy(self, radius):
         r"""

@@ -140,7 +140,7 @@ class MultiGaussianPSFModel(PSFModel):
 
     @property
     def _shape_parameters(self):
-        return [getattr(self, name).value for name in self.param_names[3:]]
+        return [one.value for one in self._all_parameters()[3:]]
 
     @property
     def weights(self):
@@ -301,8 +301,8 @@ class MultiGaussianPSFModel(PSFModel):
             tied to it. The derivatives by fixed parameters, which no fit
             uses, are set to zero and not computed.
         """
-        free = [bool(not parameter.fixed or parameter.tied) for parameter in
-                (getattr(self, name) for name in self.param_names)]
+        free = [bool(not one.fixed or one.tied)
+                for one in self._all_parameters()]
         values = flux, x_0, y_0, *shape
         flux = float(np.squeeze(split_flux(flux)[0]))
         dx = np.asarray(x, float) - np.squeeze(x_0)

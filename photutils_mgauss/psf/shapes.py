@@ -346,11 +346,9 @@ def _measure_mixtures(mixtures):
         c = mixture.covariances
         table = np.column_stack([mixture.weights, mixture.means, c[:, 0, 0],
                                  c[:, 0, 1], c[:, 1, 1]])
-        spread = np.einsum('k,kij->ij', np.abs(mixture.weights),
-                           mixture.covariances)
-        spread /= np.abs(mixture.weights).sum()
-        state = np.array([[*moments.mean, spread[0, 0], spread[0, 1],
-                           spread[1, 1]]])
+        size = np.abs(mixture.weights)
+        spread = size @ table[:, 3:] / size.sum()
+        state = np.array([[*moments.mean, *spread]])
         sums, status = np.empty((1, 6)), np.empty(1, np.int64)
         kernels.adapt_to_mixtures(table[None], state, _TOLERANCE, _MAX_STEPS,
                                   np.inf, sums, status)
@@ -360,15 +358,17 @@ def _measure_mixtures(mixtures):
 
 def _shapes(rows, single, pitch, origin):
     """Turn rows of state, sum, errors and status into Shapes."""
-    status = rows[:, 11].astype(int)
-    rows = np.where(status[:, None] == 0, rows, np.nan)
-    x, y, xx, xy, yy, total = rows[:, :6].T
-    xx, xy, yy = xx / pitch[0]**2, xy / pitch.prod(), yy / pitch[1]**2
+    if single:
+        rows = rows[0]
+    *rest, status = rows.T
+    pitch_x, pitch_y = pitch
+    x, y, xx, xy, yy, total, *errors = np.where(status == 0, rest, np.nan)
+    xx, xy, yy = xx / pitch_x**2, xy / (pitch_x * pitch_y), yy / pitch_y**2
     r2 = xx + yy
-    x_err, y_err, r2_err, e1_err, e2_err = rows[:, 6:11].T
-    columns = [r2, (xx - yy) / r2, 2 * xy / r2, (x - origin[0]) / pitch[0],
-               (y - origin[1]) / pitch[1], 2 * total / pitch.prod(),
-               r2_err / pitch[0] / pitch[1], e1_err, e2_err,
-               x_err / pitch[0], y_err / pitch[1], status]
-    return Shapes(*(column[0].item() if single else column
+    x_err, y_err, r2_err, e1_err, e2_err = errors
+    columns = [r2, (xx - yy) / r2, 2 * xy / r2, (x - origin[0]) / pitch_x,
+               (y - origin[1]) / pitch_y, 2 * total / (pitch_x * pitch_y),
+               r2_err / pitch_x / pitch_y, e1_err, e2_err,
+               x_err / pitch_x, y_err / pitch_y, status.astype(int)]
+    return Shapes(*(column.item() if single else column
                     for column in columns))

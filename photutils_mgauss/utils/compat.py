@@ -4,6 +4,7 @@ Everything that depends on the version of photutils.
 When photutils >= 3.1 is the oldest supported, this file can go.
 """
 from copy import copy, deepcopy
+from operator import attrgetter
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -42,8 +43,8 @@ def group_class(model):
     public = type(model)
     if '_ready' not in model.__dict__:
         return public
-    flags = ''.join('01'[getattr(model, name).fixed]
-                    for name in model.param_names)
+    flags = ''.join(['01'[one.fixed] for one in
+                     attrgetter(*model.param_names)(model)])
     key = (public, model._state, flags)
     cls = _CLASSES.get(key)
     if cls is None:
