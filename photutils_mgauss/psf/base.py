@@ -128,11 +128,10 @@ class PSFModel(Fittable2DModel):
 
         A free parameter carries along those that are tied to it, which
         astropy's fitters leave out: what they move is the sum of the columns
-        times the derivatives of the ties.
+        times the derivatives of the ties. It takes long: ask first whether
+        there are any, but not has_tied, for which astropy makes a dict of all
+        parameters.
         """
-        # Not has_tied, for which astropy makes a dict of all parameters.
-        if not any(one.tied for one in self._all_parameters()):
-            return columns
         values = np.array([float(np.squeeze(v)) for v in values])
         free = [i for i, name in enumerate(self.param_names)
                 if not (self.fixed[name] or self.tied[name])]

@@ -374,8 +374,10 @@ n_components=1)>
         self._run(1, x, y, x_0, y_0, out=out)
         self._mark_outside(x_0, y_0, out)
         out[1:] *= flux
-        return self._along_ties(list(out.reshape(3, *shape)),
-                                (flux, x_0, y_0))
+        columns = list(out.reshape(3, *shape))
+        return (self._along_ties(columns, (flux, x_0, y_0))
+                if any(one.tied for one in self._all_parameters())
+                else columns)
 
     def mixture_at(self, x, y):
         """

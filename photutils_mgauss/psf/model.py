@@ -301,8 +301,10 @@ class MultiGaussianPSFModel(PSFModel):
             tied to it. The derivatives by fixed parameters, which no fit
             uses, are set to zero and not computed.
         """
-        free = [bool(not one.fixed or one.tied)
-                for one in self._all_parameters()]
+        parameters = self._all_parameters()
+        tied = [bool(one.tied) for one in parameters]
+        free = [is_tied or not one.fixed
+                for one, is_tied in zip(parameters, tied, strict=True)]
         values = flux, x_0, y_0, *shape
         flux = float(np.squeeze(split_flux(flux)[0]))
         dx = np.asarray(x, float) - np.squeeze(x_0)
@@ -314,10 +316,10 @@ class MultiGaussianPSFModel(PSFModel):
             columns = self._position_derivatives(dx, dy, flux,
                                                  _rows_of(shape))
         zero = np.zeros(lattice)
-        columns += [zero] * (len(free) - len(columns))
         columns = [column.reshape(lattice) if is_free else zero
-                   for column, is_free in zip(columns, free, strict=True)]
-        return self._along_ties(columns, values)
+                   for column, is_free in zip(columns, free, strict=False)]
+        columns += [zero] * (len(free) - len(columns))
+        return self._along_ties(columns, values) if any(tied) else columns
 
     def _position_derivatives(self, dx, dy, flux, rows):
         out = np.empty((3, dx.size))
