@@ -27,7 +27,6 @@ figure, axes = plt.subplots(3, 1, figsize=(3.5, 6.6), layout='constrained')
 plot_projection(fit, image, oversampling=4, ax=axes[0])
 plot_profile(fit, image, ax=axes[1])
 plot_ellipses(fit.mixture, ax=axes[2])
-axes[1].legend(loc='upper right')
 axes[2].legend(loc='center left', bbox_to_anchor=(1, 0.5))
 for ax, title in zip(axes, ('summed along y', 'the brightest row',
                             'one-sigma ellipses'), strict=True):

@@ -1,8 +1,8 @@
 """
 The posterior of a mixture.
 
-Draws of the weights and widths of two Gaussians, from PyMC, as in Appendix A
-of Nie et al.: histograms, and the traces of the two chains.
+Draws of the weight and the width of one of two Gaussians, from PyMC, as in
+Appendix A of Nie et al.: histograms, and the traces of the two chains.
 """
 import matplotlib.pyplot as plt
 import numpy as np
@@ -19,8 +19,10 @@ image = truth.render((17, 17), 8, 8) + noise
 posterior = sample_mixture(image, 2, draws=300, tune=300, chains=2,
                            rng=1)
 figure, axes = plt.subplots(2, 2, figsize=(3.5, 4), layout='constrained')
-for row, name in zip(axes, ('weights', 'stddevs'), strict=True):
+for row, name in zip(axes, ('weight_1', 'x_stddev_1'), strict=True):
     plot_posterior(posterior, name, ax=row[0])
     plot_trace(posterior, name, ax=row[1])
-    # The colours are those of the histograms, whose legend tells them.
-    row[1].get_legend().remove()
+for ax in axes.flat:
+    # One curve each, which its axis names.
+    ax.get_legend().remove()
+    ax.locator_params(axis='x', nbins=4)

@@ -42,3 +42,4 @@ for ax, mixture, title in ((axes[0], psf, 'the true PSF'),
     table = photometry(image, error=error, init_params=start)
     pixel_phase_error(x, table['x_fit']).plot(ax=ax)
     ax.set_title(title)
+    ax.label_outer()

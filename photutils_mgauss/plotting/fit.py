@@ -125,7 +125,11 @@ def plot_profile(fit, image, *, ax=None):
         ax.plot(shown, style, color=colour, label=name)
     ax.set(yscale='log', xlabel='x [image pixel]',
            ylabel='flux density / peak')
-    ax.legend()
+    # Above the peak, because the wings take up the sides: the upper third of
+    # the decades is for it.
+    bottom = min(ax.get_ylim()[0], 0.1)
+    ax.set_ylim(bottom, bottom**-0.5)
+    ax.legend(loc='upper center', ncols=3, handlelength=1, columnspacing=1)
     return ax
 
 

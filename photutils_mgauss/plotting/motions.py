@@ -263,13 +263,16 @@ def plot_proper_motions(stars, *, membership=None, ax=None):
             np.asarray(membership)[free], cmap='viridis', vmin=0, vmax=1,
             zorder=3)
         colour_bar(ax, shown, 'membership')
-    for which, colour, label in ((~reference, BLUE, 'stars'),
-                                 (reference, ORANGE, 'references')):
+    # References stand on few places, where many stars are: on top of these.
+    for which, style, label in (
+            (~reference, {'color': BLUE, 'alpha': 0.5, 'markersize': 3},
+             'stars'),
+            (reference, {'color': ORANGE, 'markersize': 5, 'zorder': 4},
+             'references')):
         some = stars[which]
         ax.errorbar(some['pmra'].value, some['pmdec'].value,
                     some['pmdec_error'].value, some['pmra_error'].value,
-                    fmt='.', color=colour, alpha=0.5, elinewidth=0.5,
-                    markersize=3, label=label)
+                    fmt='.', elinewidth=0.5, label=label, **style)
     unit = stars['pmra'].unit
     ax.set(xlabel=rf'$\mu_{{\alpha*}}$ [{unit}]',
            ylabel=rf'$\mu_\delta$ [{unit}]', aspect='equal')

@@ -27,6 +27,8 @@ def colour_bar(ax, shown, label=''):
     bar = ax.figure.colorbar(shown, cax=beside, label=label)
     # Numbers of many digits would push the label out of a usual figure.
     beside.ticklabel_format(axis='y', scilimits=(-2, 3), useMathText=True)
+    # A power of ten stands above the numbers, not beside the title.
+    beside.yaxis.get_offset_text().set_horizontalalignment('left')
     return bar
 
 

@@ -49,6 +49,28 @@ def test_the_profile_is_the_brightest_row(ax, fit):
     assert ax.get_yscale() == 'log'
 
 
+def test_the_legend_of_the_profile_covers_none_of_it(fit):
+    figure = Figure(figsize=(3.3, 2.2), layout='constrained')
+    ax = figure.subplots()
+    plotting.plot_profile(fit, IMAGE, ax=ax)
+    figure.draw_without_rendering()
+    bottom = ax.get_legend().get_window_extent().y0
+    for line in ax.lines:
+        y = ax.transData.transform(line.get_xydata())[:, 1]
+        assert np.nanmax(y) < bottom
+
+
+def test_the_power_of_ten_of_a_colour_bar_is_not_beside_the_title():
+    figure = Figure(figsize=(3.3, 2.5), layout='constrained')
+    ax = plotting.plot_shape_map([0, 1], [0, 1], [-0.01, 0.02], label='size',
+                                 ax=figure.subplots())
+    figure.draw_without_rendering()
+    bar, = ax.child_axes
+    power = bar.yaxis.get_offset_text()
+    assert power.get_text()
+    assert power.get_window_extent().x0 > bar.get_window_extent().x0
+
+
 def test_residuals_of_several_numbers_share_their_colours():
     axes = Figure().subplots(1, 3)
     table = compare_n_components(IMAGE, (1, 2))
