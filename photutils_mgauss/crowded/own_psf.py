@@ -16,7 +16,7 @@ __all__ = ['fit_crowded_psf']
 def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
                     n_components=6, degree='auto', radius=15, max_stars=300,
                     min_snr=50, saturation=None, effective_gain=None,
-                    background_size=64, max_passes=12, executor=None,
+                    background_size=64, max_passes=20, executor=None,
                     checkpoint=None, progress_bar=False):
     """
     Fit the PSF of a crowded image and its stars in turns.
@@ -130,7 +130,7 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
                                        minimum=1),
         degree=degree, max_passes=as_integer(max_passes, 'max_passes',
                                              minimum=1),
-        progress_bar=bool(progress_bar))
+        background_size=background_size, progress_bar=bool(progress_bar))
     photometry = CrowdedMixturePhotometry(
         None, effective_gain=effective_gain, background_size=background_size,
         executor=executor, checkpoint=checkpoint)

@@ -16,8 +16,9 @@ from astropy.table import QTable, vstack
 from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss.crowded import psf_stars
+from photutils_mgauss.crowded.far_light import far_light
 from photutils_mgauss.field.base import lattice
-from photutils_mgauss.field.fit import fit_mixture_field
+from photutils_mgauss.field.fit import fit_mixture_field, with_light_beyond
 from photutils_mgauss.field.stages import n_terms
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.utils.image import with_unit
@@ -40,8 +41,9 @@ _CAUTION, _LEAST_ERROR, _MOST_ERROR = 2.0, 0.01, 0.3
 # 'auto' goes up to this degree, with so many stars for each term.
 _TOP_DEGREE, _STARS_PER_TERM = 4, 40
 # The PSF has come to rest when it changes by less than this from one pass to
-# the next, as a fraction, or by more than this part of the change before.
-_REST, _STALL = 1e-3, 0.7
+# the next, as a fraction: even if it went on so slowly as to keep four fifths
+# of each step, it would come no further than photometry says it may be off.
+_REST = 2e-3
 # Of larger images, so many windows of this size along an axis are solved:
 # enough stars for a PSF [pix].
 _LARGEST, _WINDOW, _WINDOWS = 1536, 320, 5
@@ -58,7 +60,8 @@ class LoopOptions:
     rules: psf_stars.Rules = field(default_factory=psf_stars.Rules)
     n_components: int = 6
     degree: object = 'auto'
-    max_passes: int = 12
+    max_passes: int = 20
+    background_size: float | None = 64
     progress_bar: bool = False
 
     def radius(self, number):
@@ -222,26 +225,36 @@ def fit_field(pixels, options, solve, effective_gain=None):
     MixtureField
     """
     image = CrowdedImage.of(pixels, effective_gain)
-    field = first_field(image, options.rules)
-    before = np.inf
+    passes, steady = [first_field(image, options.rules)], 0
     with progress(total=options.max_passes, desc='PSF',
                   shown=options.progress_bar) as bar:
         for number in range(options.max_passes):
-            last, field = field, next_field(image, field, number, options,
-                                            solve)
-            change = difference(field, last)
+            field, solved = next_field(image, passes[-1], number, options,
+                                       solve)
+            change = difference(field, passes[-1])
+            passes = [*passes[-2:], field]
             _advance(bar, field, change)
-            # A pass that goes deeper may change more than the one before.
-            if options.is_last_kind(number, field.degree, len(field.stars)):
-                if change < _REST or change > _STALL * before:
-                    break
-                before = change
+            # A pass that goes deeper than the one before does not tell how
+            # they go on.
+            steady += options.is_last_kind(number, field.degree,
+                                           len(field.stars))
+            if steady and (change < _REST
+                           or (steady > 2 and turns_back(*passes))):
+                break
         else:
             warnings.warn(
                 f'the PSF still changes by {change:.2%} from pass to pass '
                 f'after max_passes={options.max_passes}', AstropyUserWarning,
                 stacklevel=4)
-    return _with_unit(field, pixels.unit)
+    return _with_unit(_with_far_light(field, passes[-2], solved, image,
+                                      options), pixels.unit)
+
+
+def _with_far_light(field, before, solved, image, options):
+    """Return the field with the light beyond its stamps, if it is seen."""
+    wings = far_light(solved, grid_of(before), image.windows, field.radius,
+                      options.background_size)
+    return with_light_beyond(field, wings) if wings.is_seen else field
 
 
 def _with_unit(field, unit):
@@ -291,7 +304,14 @@ def _found_in(window, data, variance, rules):
 
 
 def next_field(image, field, number, options, solve):
-    """Solve the image with a field, and fit the next one to its stars."""
+    """
+    Solve the image with a field, and fit the next one to its stars.
+
+    Returns
+    -------
+    MixtureField
+    Solved
+    """
     rules = options.rules
     psf = grid_of(field)
     threshold = _THRESHOLDS[min(number, len(_THRESHOLDS) - 1)]
@@ -309,7 +329,7 @@ def next_field(image, field, number, options, solve):
         degree=options.degree_of(number, len(used)),
         radius=options.radius(number), local_bkg=number < _OWN_SKY,
         effective_gain=np.inf, normalise='stamps', brighter_fatter=False)
-    return _with_reasons(new, stars)
+    return _with_reasons(new, stars), solved
 
 
 def _with_reasons(field, stars):
@@ -356,6 +376,18 @@ def difference(field, other):
                     for one in (field, other))
         squares.append(((new - old)**2).sum() / (new**2).sum())
     return float(np.sqrt(np.mean(squares)))
+
+
+def turns_back(first, second, third):
+    """
+    Tell whether fields, the last of a row, no longer go one way.
+
+    Around its end the row wanders as the chosen stars and the noise do. As
+    long as it goes on in one direction it has not come there, however small
+    its steps: wings, sky and faint stars of dense fields take many.
+    """
+    return difference(third, first)**2 < (difference(second, first)**2
+                                          + difference(third, second)**2)
 
 
 def _advance(bar, field, change):

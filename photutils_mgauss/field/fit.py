@@ -325,6 +325,11 @@ def _with_wings(field, sample, exposures, normalise):
     _LOG.info('%.4f +- %.4f of the light of stars is beyond their stamps; it '
               'is in the PSF as one wide Gaussian, and in fluxes',
               wings.share, wings.error)
+    return with_light_beyond(field, wings)
+
+
+def with_light_beyond(field, wings):
+    """Return a field with the light of `Wings` in its PSF and its fluxes."""
     new = field.stars.copy()
     new['flux_fit'] = new['flux_fit'] / (1 - wings.share)
     return replace(field, stars=new, wing_share=wings.share,

@@ -29,10 +29,10 @@ _WIDTHS, _LARGEST = 4, 20
 # Rings from the radius of the stamps to so many times that.
 _N_RINGS, _REACH = 10, 3.0
 # The slopes of power laws that are looked for: a flatter one has no end.
-_FLATTEST, _STEEPEST = 2.5, 6.0
+SLOPES = np.linspace(2.5, 6.0, 36)
 # What is expected of them: diffraction's, within a Cauchy distribution of this
 # width, whose tails let stars say otherwise, as those of seeing do.
-_USUAL_SLOPE, _SLOPE_WIDTH = 3.0, 0.25
+USUAL_SLOPE, _SLOPE_WIDTH = 3.0, 0.25
 _CLIP, _LEAST_SCATTER = 4.0, 1e-75
 _FEWEST_STARS = 5
 # Light that is seen beyond doubt [standard deviations].
@@ -61,6 +61,19 @@ class Wings:
     error: float
     stddev: float
     significance: float
+
+    @classmethod
+    def of(cls, light, error, significance, inside, radius):
+        """
+        Return the Gaussian of light beyond the stamps.
+
+        ``light`` and its error are in fluxes of the stars, as the light
+        ``inside`` and the error of that.
+        """
+        total = inside[0] + max(light, 0)
+        return cls(float(max(1 - 1 / total, 0)),
+                   float(np.hypot(error, inside[1]) / total**2),
+                   _SIZE * radius, float(significance))
 
     @property
     def is_seen(self):
@@ -173,11 +186,8 @@ def measure_wings(exposures, catalogues, stars, inside, radius):
                       f'up to {_REACH:.0f} radii around, got {enough}')
     middle = np.sqrt(edges[1:] * edges[:-1]) / edges[0]
     light, error, significance = _light_beyond(flux, means, counts, middle)
-    light, error = light * edges[0] ** 2, error * edges[0] ** 2
-    total = inside[0] + max(light, 0)
-    return Wings(float(max(1 - 1 / total, 0)),
-                 float(np.hypot(error, inside[1]) / total**2),
-                 _SIZE * radius, float(significance)), ''
+    return Wings.of(light * edges[0] ** 2, error * edges[0] ** 2,
+                    significance, inside, radius), ''
 
 
 def _ring_means(pixels, catalogue, stars, edges):
@@ -216,11 +226,10 @@ def _light_beyond(flux, means, counts, middle):
 
     The third number is the significance of the light in the rings.
     """
-    slopes = np.linspace(_FLATTEST, _STEEPEST, 36)
     kept = counts > 0
     for _ in range(4):
         fits = [_height(flux[:, None] * middle**-slope, means, counts * kept)
-                for slope in slopes]
+                for slope in SLOPES]
         best = min(fits, key=lambda fit: fit.chi2)
         pulls = best.residual * np.sqrt(counts)
         # In an image without noise it is 0; its square must not be.
@@ -230,16 +239,34 @@ def _light_beyond(flux, means, counts, middle):
                              for name in ('height', 'error', 'chi2'))
     # What is beside a star spoils several of its rings: they count as one.
     scatter *= np.sqrt(len(middle))
-    cost = (chi2 / scatter**2
-            + 2 * np.log1p(((slopes - _USUAL_SLOPE) / _SLOPE_WIDTH) ** 2))
+    return over_slopes(heights, errors * scatter, chi2 / scatter**2)
+
+
+def over_slopes(heights, errors, chi2):
+    """
+    Return the light beyond a radius, over its square, and the error.
+
+    Parameters
+    ----------
+    heights, errors, chi2 : (n,) `~numpy.ndarray`
+        For each of ``SLOPES``, the surface brightness at the radius in units
+        of flux, its error, and how well it fits.
+
+    Returns
+    -------
+    light, error : float
+    significance : float
+        Of the most likely height.
+    """
+    cost = chi2 + 2 * np.log1p(((SLOPES - USUAL_SLOPE) / _SLOPE_WIDTH) ** 2)
     likely = np.exp(-0.5 * (cost - cost.min()))
     likely /= likely.sum()
-    factor = 2 * np.pi / (slopes - 2)
+    factor = 2 * np.pi / (SLOPES - 2)
     mean = likely @ (heights * factor)
     variance = likely @ ((heights * factor - mean) ** 2
-                         + (errors * scatter * factor) ** 2)
+                         + (errors * factor) ** 2)
     peak = np.argmax(likely)
-    return mean, np.sqrt(variance), heights[peak] / (errors[peak] * scatter)
+    return mean, np.sqrt(variance), heights[peak] / errors[peak]
 
 
 class _Fit(NamedTuple):

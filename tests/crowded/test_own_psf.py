@@ -2,6 +2,7 @@
 import sys
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
@@ -25,6 +26,8 @@ from photutils_mgauss import (
     simulate,
 )
 from photutils_mgauss.crowded import psf_loop
+from photutils_mgauss.field.growth import Wings
+from photutils_mgauss.utils.image import read_pixels
 
 SHAPE = (160, 160)
 QUICK = {'n_components': 3, 'degree': 1, 'radius': 10, 'max_stars': 100}
@@ -241,9 +244,40 @@ def test_faint_stars_of_a_dense_field_are_no_wings_of_the_psf():
                         psf.encircled_energy(radius), atol=0.01)
 
 
-def test_a_deeper_pass_does_not_end_the_loop(monkeypatch):
-    # Its change says nothing of how the one before it converged.
-    changes = iter([0.1, 0.01, 0.01, 0.01, 0.2, 0.1, 0.05, 0.04])
-    monkeypatch.setattr(psf_loop, 'difference', lambda *_: next(changes))
-    fit_crowded_psf(**corner(), **QUICK)
-    assert next(changes, None) is None
+@pytest.mark.parametrize(('places', 'n_passes'), [
+    # Slowly on and on, then here and there.
+    ([9, 5, 3, 2, 1, 0.8, 0.64, 0.5, 0.4, 0.33, 0.35, 0.2], 10),
+    # At rest.
+    ([9, 5, 3, 2, 1, 0.8, 0.64, 0.64], 7),
+    # What a deeper pass changes says nothing of how it goes on.
+    ([9, 5, 3, 2, 1, 2, 1.5, 1.2, 1.3], 8)])
+def test_the_loop_ends_where_the_psf_no_longer_goes_one_way(
+        monkeypatch, places, n_passes):
+    fields = [SimpleNamespace(place=place, degree=0,
+                              stars=Table({'used': [True]}))
+              for place in places]
+    passes = iter(fields[1:])
+    for name, instead in {
+            'first_field': lambda *_: fields[0],
+            'next_field': lambda *_: (next(passes), None),
+            'difference': lambda a, b: abs(a.place - b.place),
+            '_with_far_light': lambda field, *_: field,
+            '_with_unit': lambda field, _: field}.items():
+        monkeypatch.setattr(psf_loop, name, instead)
+    pixels = read_pixels(np.ones((9, 9)), np.ones((9, 9)))
+    found = psf_loop.fit_field(pixels, psf_loop.LoopOptions(), None, 1.0)
+    assert found is fields[n_passes]
+
+
+def test_light_beyond_the_stamps_is_in_the_psf(monkeypatch):
+    known, light = field_of_corner(), 0.02
+    monkeypatch.setattr(psf_loop, 'far_light', lambda *_: Wings.of(
+        light, 0.001, 20.0, (1.0, 0.0), QUICK['radius']))
+    own = fit_crowded_psf(**corner(), **QUICK)
+    assert_allclose(own.wing_share, light / (1 + light))
+    assert own.wing_stddev > QUICK['radius']
+    assert_allclose(own.stars['flux_fit'],
+                    known.stars['flux_fit'] * (1 + light))
+    assert_allclose(own.mixture_at(40, 40).encircled_energy(3),
+                    known.mixture_at(40, 40).encircled_energy(3)
+                    / (1 + light), rtol=1e-3)
