@@ -25,7 +25,10 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
     With it the function finds all bright stars of the image. It subtracts
     all but the best of them, fits a better PSF to these, and finds fainter
     stars. In each pass the search goes deeper and the PSF may vary more
-    over the image, until it no longer changes.
+    over the image, until it no longer goes on changing in one direction.
+    Light of the stars beyond ``radius`` is measured from all of them
+    together; if it is significant, it is added as one wide Gaussian, as
+    `fit_mixture_field` does.
 
     Of images larger than 1536 pixels, five windows of 320 pixels along each
     long axis are used.
@@ -84,7 +87,8 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
         ``crowding`` and the ``reason``: 'edge'; 'masked', near bad pixels;
         'faint'; 'extended'; 'blended', more than half of the light in its
         pixels belongs to other stars; 'surplus', there are better stars
-        nearby; 'deviant', different from the other stars. ``to_grid``
+        nearby; 'deviant', different from the other stars. Its
+        ``wing_share`` is the light beyond ``radius``. ``to_grid``
         converts the field to a PSF for `CrowdedMixturePhotometry`.
 
     Raises

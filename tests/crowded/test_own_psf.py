@@ -271,13 +271,14 @@ def test_the_loop_ends_where_the_psf_no_longer_goes_one_way(
 
 def test_light_beyond_the_stamps_is_in_the_psf(monkeypatch):
     known, light = field_of_corner(), 0.02
-    monkeypatch.setattr(psf_loop, 'far_light', lambda *_: Wings.of(
-        light, 0.001, 20.0, (1.0, 0.0), QUICK['radius']))
-    own = fit_crowded_psf(**corner(), **QUICK)
-    assert_allclose(own.wing_share, light / (1 + light))
-    assert own.wing_stddev > QUICK['radius']
-    assert_allclose(own.stars['flux_fit'],
-                    known.stars['flux_fit'] * (1 + light))
-    assert_allclose(own.mixture_at(40, 40).encircled_energy(3),
-                    known.mixture_at(40, 40).encircled_energy(3)
-                    / (1 + light), rtol=1e-3)
+    seen = SimpleNamespace(windows=[])
+    for significance, share in ((20.0, light / (1 + light)), (2.0, 0.0)):
+        wings = Wings.of(light, 0.001, significance, (1.0, 0.0),
+                         QUICK['radius'])
+        monkeypatch.setattr(psf_loop, 'far_light',
+                            lambda *_, wings=wings: wings)
+        own = psf_loop._with_far_light(known, known, None, seen,
+                                       psf_loop.LoopOptions())
+        assert_allclose(own.wing_share, share)
+        assert_allclose(own.stars['flux_fit'],
+                        known.stars['flux_fit'] / (1 - share))
