@@ -45,7 +45,7 @@ _USUAL = int(np.argmin(np.abs(SLOPES - USUAL_SLOPE)))
 _TINY, _LEAST_SCATTER = 1e-9, 1e-75
 
 
-def far_light(solved, psf, windows, radius, spacing):
+def far_light(solved, psf, radius):
     """
     Measure what stars have beyond a radius that the PSF has not.
 
@@ -55,12 +55,8 @@ def far_light(solved, psf, windows, radius, spacing):
         The stars of the image, and what they and the sky leave.
     psf : GriddedMixturePSF
         With which it was solved.
-    windows : list of (slice, slice) tuple
-        The parts of the image that were solved.
     radius : float
         [pix]
-    spacing : float or None
-        The distance of the nodes of the sky [pix], None for no sky.
 
     Returns
     -------
@@ -73,10 +69,10 @@ def far_light(solved, psf, windows, radius, spacing):
     light = MixtureRenderer(psf).image(stars, _FAINTEST * solved.noise,
                                        solved.residual.shape)
     matrix, right = 0, 0
-    for window in windows:
+    for window in solved.windows:
         start = np.array([[window[1].start], [window[0].start], [0]])
         one = _equations(solved.residual[window], solved.variance[window],
-                         light[window], stars - start, edges, spacing)
+                         light[window], stars - start, edges, solved.spacing)
         matrix, right = matrix + one[0], right + one[1]
     beyond, error, significance = _beyond(matrix, right)
     area = edges[-1]**2

@@ -134,7 +134,7 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
                                        minimum=1),
         degree=degree, max_passes=as_integer(max_passes, 'max_passes',
                                              minimum=1),
-        background_size=background_size, progress_bar=bool(progress_bar))
+        progress_bar=bool(progress_bar))
     photometry = CrowdedMixturePhotometry(
         None, effective_gain=effective_gain, background_size=background_size,
         executor=executor, checkpoint=checkpoint)

@@ -446,7 +446,6 @@ class CrowdedMixturePhotometry:
             return self.psf_model
         from photutils_mgauss.crowded.psf_loop import LoopOptions
         field, model = self.fit_field(image, LoopOptions(
-            background_size=self.background_size,
             progress_bar=self.progress_bar))
         keep(self, field=field, psf_used=model)
         return model

@@ -61,7 +61,6 @@ class LoopOptions:
     n_components: int = 6
     degree: object = 'auto'
     max_passes: int = 20
-    background_size: float | None = 64
     progress_bar: bool = False
 
     def radius(self, number):
@@ -130,13 +129,16 @@ class Solved:
 
     ``residual`` and ``variance`` (ny, nx) are of the data less all stars and
     the sky; the variance, 0 where nothing was solved, has the photon noise
-    of the model.
+    of the model. The sky has a node every ``spacing`` pixels of each of the
+    ``windows`` (slice, slice), none if that is None.
     """
 
     table: QTable
     residual: np.ndarray
     variance: np.ndarray
     noise: float
+    windows: list
+    spacing: float | None
 
     @classmethod
     def with_psf(cls, image, psf, solve, **options):
@@ -147,14 +149,16 @@ class Solved:
             data, before = image.pixels.part(window)
             if not (before > 0).any():
                 continue
-            table, model = _solve_window(data, before, _moved(psf, window),
-                                         image.gain, solve, options)
+            photometry = solve(_moved(psf, window), effective_gain=image.gain,
+                               **options)
+            table, model = _solve_window(data, before, photometry)
             residual[window] = np.where(before > 0, data - model, 0)
             variance[window] = _of_model(before, residual[window], image.gain)
             tables.append(_in_image(table, window))
             noise.append(np.median(before[before > 0]))
         return cls(vstack(tables), residual, variance,
-                   float(np.sqrt(np.median(noise))))
+                   float(np.sqrt(np.median(noise))), image.windows,
+                   photometry.background_size)
 
     def with_stars(self, psf, stars):
         """Return the data less the sky and all stars but these."""
@@ -166,9 +170,8 @@ class Solved:
         return image
 
 
-def _solve_window(data, variance, psf, gain, solve, options):
+def _solve_window(data, variance, photometry):
     """Return the stars of a window and the image of its model."""
-    photometry = solve(psf, effective_gain=gain, **options)
     with warnings.catch_warnings():
         # That the PSF is not good yet is no news.
         warnings.simplefilter('ignore', AstropyUserWarning)
@@ -246,14 +249,12 @@ def fit_field(pixels, options, solve, effective_gain=None):
                 f'the PSF still changes by {change:.2%} from pass to pass '
                 f'after max_passes={options.max_passes}', AstropyUserWarning,
                 stacklevel=4)
-    return _with_unit(_with_far_light(field, passes[-2], solved, image,
-                                      options), pixels.unit)
+    return _with_unit(_with_far_light(field, passes[-2], solved), pixels.unit)
 
 
-def _with_far_light(field, before, solved, image, options):
+def _with_far_light(field, before, solved):
     """Return the field with the light beyond its stamps, if it is seen."""
-    wings = far_light(solved, grid_of(before), image.windows, field.radius,
-                      options.background_size)
+    wings = far_light(solved, grid_of(before), field.radius)
     return with_light_beyond(field, wings) if wings.is_seen else field
 
 

@@ -34,7 +34,7 @@ def wings(x, y, flux, share):
     return fftconvolve(points, law, 'same')
 
 
-def solved(share, *, sky=0.0, known=1.0):
+def solved(share, *, sky=0.0, known=1.0, spacing=64):
     """Return what is left of stars whose fluxes are that much too large."""
     x, y, flux = stars()
     rng = np.random.default_rng(2)
@@ -44,37 +44,36 @@ def solved(share, *, sky=0.0, known=1.0):
                       np.sqrt(variance))
     return SimpleNamespace(
         table=Table({'x_fit': x, 'y_fit': y, 'flux_fit': known * flux}),
-        residual=left, variance=variance, noise=np.sqrt(60 / QUIET))
-
-
-WHOLE = [(slice(0, N), slice(0, N))]
+        residual=left, variance=variance, noise=np.sqrt(60 / QUIET),
+        windows=[(slice(0, N), slice(0, N))], spacing=spacing)
 
 
 @pytest.mark.parametrize('share', [0.01, 0.03])
 def test_all_stars_together_tell_it(share):
     # A sky that took the wings of a dense field for its own, and rose.
-    wings = far_light(solved(share, sky=-3.0), PSF, WHOLE, RADIUS, 64)
+    wings = far_light(solved(share, sky=-3.0), PSF, RADIUS)
     assert abs(wings.share / (1 - wings.share) - share) < 0.15 * share
     assert wings.is_seen
     assert wings.stddev == 2 * RADIUS
 
 
 def test_where_there_is_none_none_is_seen():
-    wings = far_light(solved(0.0), PSF, WHOLE, RADIUS, 64)
+    wings = far_light(solved(0.0), PSF, RADIUS)
     assert wings.share < 0.002
     assert not wings.is_seen
 
 
 def test_light_that_the_psf_lacks_inside_is_not_beyond():
-    wings = far_light(solved(0.0, known=0.99), PSF, WHOLE, RADIUS, 64)
+    wings = far_light(solved(0.0, known=0.99), PSF, RADIUS)
     assert not wings.is_seen
 
 
 def test_windows_tell_it_together_and_bad_pixels_nothing():
-    known = solved(0.03)
+    known = solved(0.03, spacing=None)
     known.residual[40:80, 100:200] = 1e6
     known.variance[40:80, 100:200] = 0
-    half = [(slice(0, N // 2), slice(0, N)), (slice(N // 2, N), slice(0, N))]
-    wings = far_light(known, PSF, half, RADIUS, None)
+    known.windows = [(slice(0, N // 2), slice(0, N)),
+                     (slice(N // 2, N), slice(0, N))]
+    wings = far_light(known, PSF, RADIUS)
     assert abs(wings.share - 0.03) < 0.006
     assert wings.is_seen

@@ -271,14 +271,12 @@ def test_the_loop_ends_where_the_psf_no_longer_goes_one_way(
 
 def test_light_beyond_the_stamps_is_in_the_psf(monkeypatch):
     known, light = field_of_corner(), 0.02
-    seen = SimpleNamespace(windows=[])
     for significance, share in ((20.0, light / (1 + light)), (2.0, 0.0)):
         wings = Wings.of(light, 0.001, significance, (1.0, 0.0),
                          QUICK['radius'])
         monkeypatch.setattr(psf_loop, 'far_light',
                             lambda *_, wings=wings: wings)
-        own = psf_loop._with_far_light(known, known, None, seen,
-                                       psf_loop.LoopOptions())
+        own = psf_loop._with_far_light(known, known, None)
         assert_allclose(own.wing_share, share)
         assert_allclose(own.stars['flux_fit'],
                         known.stars['flux_fit'] / (1 - share))
