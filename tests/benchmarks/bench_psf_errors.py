@@ -15,14 +15,19 @@ by in the mean moves all its stars by the same, as its pointing does: x and y
 are given about the mean difference, too. The light beyond the stamps of
 either exposure makes all fluxes differ by one ratio: they are given about
 that, too, and what the ratio is off by over the errors ``wing_error`` of both.
-In brackets the same without the part of the PSF. The optics are those of
-`photutils_mgauss.simulation`, or the table FILE of the harness in DIR
+In brackets the same without the part of the PSF. The scatter (+-) is that of
+pulls whose errors are right: errors of one PSF move all stars of a scene
+together, so that few scenes tell little of the mean. It is drawn from the
+field's covariance, each scene by itself; what few stars do not tell is the
+same in all scenes of one set of optics, which makes it larger. The optics are
+those of `photutils_mgauss.simulation`, or the table FILE of the harness in DIR
 (csst_psf). --time compares the photometry of 20,000 stars with and without.
 """
 import argparse
 import sys
 import time
 import warnings
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -34,6 +39,7 @@ from photutils_mgauss import (
     csst_psf,
     fit_mixture_field,
 )
+from photutils_mgauss.field.normal import to_coefficients
 from photutils_mgauss.psf.centre import centres
 
 CELL, ZERO_POINT, SKY = 46, 32.24, 115.0
@@ -41,6 +47,7 @@ KERNELS = {'none': None, 'bilinear': np.full((2, 2), 0.25),
            'drizzle': np.array([[0.02, 0.1, 0.02], [0.1, 0.52, 0.1],
                                 [0.02, 0.1, 0.02]])}
 NAMES = 'x', 'y', 'flux'
+DRAWS, STEP = 12, 0.05
 
 
 class PackageOptics:
@@ -143,9 +150,35 @@ def pulls(optics, n_psf, size, seed):
     x, y, flux = (np.asarray(test[name]) for name in NAMES)
     centre = optics.centre(x, y, field.centre_stddev)
     ratio = np.median(table['flux_fit'] / flux)
-    return squares([table], [table['x_fit'] - x - centre[:, 0],
-                             table['y_fit'] - y - centre[:, 1],
-                             table['flux_fit'] - ratio * flux])
+    found = squares([table], [table['x_fit'] - x - centre[:, 0],
+                              table['y_fit'] - y - centre[:, 1],
+                              table['flux_fit'] - ratio * flux])
+    return [[*one, scatter] for one, scatter in zip(
+        found, scatter_of_squares(field, table, clean, error, test),
+        strict=True)]
+
+
+def scatter_of_squares(field, table, clean, error, test):
+    """Return the variance of mean squares of pulls with right errors (3,)."""
+    def places(one):
+        found = MixturePSFPhotometry(one, 11)(clean, error=error,
+                                              init_params=test)
+        return np.array([found[f'{name}_fit'] for name in NAMES])
+
+    rng, base = np.random.default_rng(1), places(field)
+    values, vectors = np.linalg.eigh(field.covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    drawn = []
+    for _ in range(DRAWS):
+        change = to_coefficients(root @ rng.normal(size=values.size),
+                                 field.coefficients)
+        # Small steps: positions answer in proportion.
+        moved = (places(replace(field, coefficients=field.coefficients
+                                + STEP * change)) - base) / STEP
+        moved[2] -= np.median(moved[2] / base[2]) * base[2]
+        drawn.append([np.mean(shift**2 / np.asarray(table[f'{name}_err'])**2)
+                      for name, shift in zip(NAMES, moved, strict=True)])
+    return np.var(drawn, axis=0, ddof=1)
 
 
 def differences(optics, n_psf, size, kernel, seed):
@@ -167,12 +200,17 @@ def differences(optics, n_psf, size, kernel, seed):
 
 
 def report(label, one_scene, seeds):
-    found = np.sqrt(np.mean([one_scene(seed) for seed in seeds], axis=0))
+    found = np.mean([one_scene(seed) for seed in seeds], axis=0)
     names = (*NAMES, 'x about the mean', 'y about the mean',
              'flux about the ratio', 'ratio')[:len(found)]
-    print(f'{label:32s}' + '   '.join(
-        f'{name} {full:.2f} ({without:.2f})' for name, (full, without)
-        in zip(names, found, strict=True)), flush=True)
+    words = []
+    for name, (full, without, *variance) in zip(names, np.sqrt(found),
+                                                strict=True):
+        # Of a root of n scenes' mean square, which is 1 if errors are right.
+        scatter = ''.join(f' +- {one / 2 / np.sqrt(len(seeds)):.2f}'
+                          for one in variance)
+        words.append(f'{name} {full:.2f}{scatter} ({without:.2f})')
+    print(f'{label:32s}' + '   '.join(words), flush=True)
 
 
 def compare_times(optics, size):
