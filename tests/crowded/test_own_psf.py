@@ -33,6 +33,11 @@ SHAPE = (160, 160)
 QUICK = {'n_components': 3, 'degree': 1, 'radius': 10, 'max_stars': 100}
 
 
+# What does not depend on where the loop ends need not wait for its end.
+SHORT = QUICK | {'max_passes': 4}
+unfinished = pytest.mark.filterwarnings('ignore:the PSF still changes')
+
+
 @cache
 def scene():
     psf = csst_psf(SHAPE)
@@ -57,7 +62,7 @@ def corner():
 
 @cache
 def field_of_corner():
-    return fit_crowded_psf(**corner(), **QUICK)
+    return fit_crowded_psf(**corner(), **SHORT)
 
 
 @cache
@@ -146,22 +151,24 @@ def test_artificial_stars_have_the_psf_of_the_image(monkeypatch):
     assert result.stars['recovered'].mean() > 0.8
 
 
+@unfinished
 def test_only_the_stars_of_a_list_are_used():
     chosen = field().stars[::2]
     stars = Table({'x': chosen['x_fit'], 'y': chosen['y_fit'],
                    'selected': np.arange(len(chosen)) > 4})
-    own = fit_crowded_psf(**image(), **QUICK, stars=stars)
+    own = fit_crowded_psf(**image(), **SHORT, stars=stars)
     gap, row = cKDTree(np.column_stack([stars['x'], stars['y']])).query(
         np.column_stack([own.stars['x'], own.stars['y']]))
     assert gap.max() < 1.5
     assert row.min() == 5
 
 
+@unfinished
 def test_the_unit_of_the_image_comes_back(tmp_path):
     pixels = corner()
     own = fit_crowded_psf(pixels['data'] * u.electron,
                           error=pixels['error'] * u.electron,
-                          mask=pixels['mask'], **QUICK)
+                          mask=pixels['mask'], **SHORT)
     assert len(own.stars) > 3
     assert len(own.dropped) > 3
     assert own.stars['flux_fit'].unit == own.dropped['flux'].unit == u.electron
@@ -183,15 +190,16 @@ def test_of_a_large_image_windows_are_used(monkeypatch):
     assert psf_loop.difference(own, field()) < 0.05
 
 
+@unfinished
 def test_a_checkpoint_gives_the_same(tmp_path):
-    first, again = (fit_crowded_psf(**corner(), **QUICK,
+    first, again = (fit_crowded_psf(**corner(), **SHORT,
                                     checkpoint=tmp_path / 'kept')
                     for _ in range(2))
     assert_array_equal(first.coefficients, again.coefficients)
     assert_array_equal(first.coefficients, field_of_corner().coefficients)
 
 
-@pytest.mark.filterwarnings('ignore:the PSF still changes')
+@unfinished
 def test_a_bar_shows_the_passes(capfd, monkeypatch):
     monkeypatch.setattr(sys.stderr, 'isatty', lambda: True, raising=False)
     fit_crowded_psf(**corner(), **QUICK, max_passes=2, progress_bar=True)
@@ -269,6 +277,7 @@ def test_the_loop_ends_where_the_psf_no_longer_goes_one_way(
     assert found is fields[n_passes]
 
 
+@unfinished
 def test_light_beyond_the_stamps_is_in_the_psf(monkeypatch):
     known, light = field_of_corner(), 0.02
     for significance, share in ((20.0, light / (1 + light)), (2.0, 0.0)):
