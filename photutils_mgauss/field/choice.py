@@ -21,6 +21,11 @@ _FEWEST_STARS, MANY_STARS = 8, 60
 # brightest stars decide.
 _DEGREE_FOR_COMPONENTS, _STARS_FOR_COMPONENTS = 2, 100
 _FIRST_COMPONENTS = 5
+# What many stars get where the usual number leaves more than this share of the
+# light of a pixel unexplained, as strong aberrations do. It is the noise of
+# 40,000 electrons: with less missing, the noise of all but the brightest
+# stars' peaks is larger, and more Gaussians take twice the time for nothing.
+_MORE_COMPONENTS, _POOR = 8, 0.005
 # The fit without some stars starts where the one with all of them ended. It
 # must forget them: no damping.
 _FOLD_STEPS, _FOLD_TOLERANCE, _FOLD_DAMPING = 4, 0.1, 1e-7
@@ -46,6 +51,37 @@ def by_default(n_components, degree, n_stars):
 def full_degree(degree):
     """Return the degree up to which there are terms if few stars chose one."""
     return max(degree + 1, _USUAL_DEGREE)
+
+
+def with_enough_components(fit, problem, strength, workers, *, reject=True):
+    """
+    Return a fit of more Gaussians where the usual number is too few.
+
+    Parameters
+    ----------
+    fit : FieldFit
+        Of the usual number of Gaussians to many stars.
+    problem : FieldProblem
+        What it was fitted to.
+    strength : float
+        Of the prior.
+    workers : Workers
+    reject : bool, optional
+        Whether to drop deviant stars and pixels.
+
+    Returns
+    -------
+    FieldFit
+        The same one if all is well, or more Gaussians err more.
+    """
+    if fit.accuracy < _POOR:
+        return fit
+    degree = stages.term_degrees(len(fit.coefficients)
+                                 - fit.problem.n_extra)[-1]
+    workers.tell(f'{_MORE_COMPONENTS} Gaussians')
+    more = stages.run(problem, _MORE_COMPONENTS, degree, workers,
+                      strength=strength, reject=reject)
+    return more if more.accuracy < fit.accuracy else fit
 
 
 def choose(problem, n_components, degree, max_degree, strength, workers):

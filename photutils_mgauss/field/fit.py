@@ -22,7 +22,11 @@ from photutils_mgauss.field.base import (
 )
 from photutils_mgauss.field.beyond import add_degrees
 from photutils_mgauss.field.brighter_fatter import measure_fattening
-from photutils_mgauss.field.choice import MANY_STARS, choose
+from photutils_mgauss.field.choice import (
+    MANY_STARS,
+    choose,
+    with_enough_components,
+)
 from photutils_mgauss.field.contexts import lateral_shifts
 from photutils_mgauss.field.covariance import honest_covariance
 from photutils_mgauss.field.forms import TunedShapes
@@ -101,8 +105,11 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         left out as well.
     n_components : int or 'auto', optional
         The number K of Gaussians; 'auto' chooses the number from 2 to 7
-        that best describes stars left out of the fit. By default it is 6,
-        or 'auto' with 8 to 59 stars.
+        that best describes stars left out of the fit. By default it is
+        'auto' with 8 to 59 stars, and else 6; with 60 stars or more it
+        becomes 8, in twice the time, where 6 miss 0.5 % of the light of
+        bright pixels and stars are not so narrow that pixels are
+        integrated.
     degree : int or 'auto', optional
         The degree of the polynomials, 0 for a PSF that is the same
         everywhere; by default 4, or 'auto' with 8 to 59 stars, or 1 with
@@ -261,9 +268,24 @@ def _free_field(problem, sample, radius, n_components, degree, top, options,
         problem, options.pixel_integrated, options.regularization, workers)
     fit, choice = _free(problem, n_components, degree, top, workers,
                         options.regularization, options.reject)
+    if (options.n_components is None and len(problem.basis) >= MANY_STARS
+            and not problem.pixel_integrated):
+        fit = _with_enough(fit, problem, options, workers)
     fit, fatter = _fatter(fit, options.brighter_fatter, workers,
                           options.reject)
     return _result(fit, sample, radius, choice, options.centre, fatter)
+
+
+def _with_enough(fit, problem, options, workers):
+    """Return the fit, of more Gaussians where the usual number is too few."""
+    more = with_enough_components(fit, problem, options.regularization,
+                                  workers, reject=options.reject)
+    if more is not fit:
+        _LOG.info('%d Gaussians miss %.1f %% of the light in bright pixels: '
+                  'the field has %d, which miss %.1f %%',
+                  fit.coefficients.shape[1], 100 * fit.accuracy,
+                  more.coefficients.shape[1], 100 * more.accuracy)
+    return more
 
 
 def _fatter(fit, wanted, workers, reject):
