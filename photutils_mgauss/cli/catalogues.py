@@ -4,6 +4,8 @@ from pathlib import Path
 
 from photutils_mgauss.cli import tools
 
+# Bits of SExtractor for stars that have neighbours.
+_BLENDED = 3
 _TABLE_SUFFIXES = ('.ecsv', '.csv', '.txt', '.dat', '.vot', '.xml', '.votable')
 
 
@@ -43,6 +45,7 @@ def read_catalogue(options, path, i):
     from photutils_mgauss.files.tables import read_table
     table, record = read_table(path)
     say_program(options, path, table)
+    table = _without_spoilt(options, path, table)
     inside = _image_inside(table, path)
     time = tools.parse_time(tools.one_each(options.time, len(options.inputs),
                                            'time')[i])
@@ -67,6 +70,21 @@ def say_program(options, path, table):
     if 'position_errors' in table.meta:
         tools.say(options, f'{path}: errors of positions: '
                   f'{table.meta["position_errors"]}')
+
+
+def _without_spoilt(options, path, table):
+    """Leave out stars that SExtractor calls saturated or truncated."""
+    if table.meta.get('program') != 'SExtractor' or (
+            'FLAGS' not in table.colnames):
+        return table
+    spoilt = (table['FLAGS'].astype(int) & ~_BLENDED
+              & ~options.good_flags) > 0
+    if spoilt.any():
+        tools.say(options, f'{path}: left out {spoilt.sum()} of '
+                  f'{len(table)} stars, which SExtractor flags '
+                  'as saturated, truncated or incomplete (FLAGS of 4 and '
+                  'more); --good-flags takes them')
+    return table[~spoilt]
 
 
 def _image_inside(table, path):

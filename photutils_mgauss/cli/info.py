@@ -163,6 +163,6 @@ def _of_list(path, table):
     if inside is not None:
         lines.append(f'  of its image: {"a" if inside.wcs else "no"} WCS, '
                      f'time {inside.time.isot if inside.time else "unknown"}')
-    words = f' with {" and ".join(needed)}' if needed else ''
-    lines.append('  mgauss psf takes it with --stars, mgauss motions' + words)
+    words = f'with {" and ".join(needed)}' if needed else 'as it is'
+    lines.append(f'  mgauss motions takes it {words}, mgauss psf with --stars')
     return lines

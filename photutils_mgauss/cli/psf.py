@@ -5,6 +5,7 @@ from photutils_mgauss.cli import psf_together, tools
 from photutils_mgauss.cli.progress import Progress
 from photutils_mgauss.cli.psf_stars import (
     check_image,
+    check_nodes,
     check_start,
     choose,
     fit_options,
@@ -200,6 +201,7 @@ def _from_stars(image, options):
         effective_gain=image.noise.gain, **fit)
     used = field.stars[field.stars['used']]
     grid = field.to_grid(tuple(options.grid_shape))
+    check_nodes(image.path, grid, used)
     found = {'kind': 'image', 'n_stars': len(used),
              'n_components': grid.n_components, 'degree': field.degree,
              'accuracy': float(field.accuracy),

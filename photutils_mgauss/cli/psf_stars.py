@@ -1,8 +1,12 @@
 """The stars of an image that its PSF is fitted to."""
+import warnings
+
 from photutils_mgauss.cli import tools
 from photutils_mgauss.cli.catalogues import say_program
 
 _RADIUS = 10.0
+# No PSF changes its width by so much over a detector.
+_WILD = 1.5
 
 
 def check_image(image):
@@ -57,3 +61,32 @@ def no_stars(image, stars):
                        for reason in sorted(set(reasons)))
     return (f'{image.path}: must have at least 1 star good for the PSF, got '
             f'none of {len(stars)}: {counts}; try --min-snr or --radius')
+
+
+def check_nodes(path, grid, stars):
+    """
+    Warn if a PSF is wild where no star tells what it is.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Of the image.
+    grid : GriddedMixturePSF
+    stars : `~astropy.table.Table`
+        Those used, with ``x`` and ``y`` [pix].
+    """
+    import numpy as np
+    from scipy.spatial import cKDTree
+
+    from photutils_mgauss.psf.shapes import adaptive_moments
+    fwhm = np.atleast_1d(adaptive_moments(grid.mixtures).fwhm)
+    _, near = cKDTree(grid.grid_xypos).query(np.stack(
+        [np.asarray(stars[name], float) for name in 'xy'], axis=1))
+    ratio = fwhm / np.nanmedian(fwhm[near])
+    wild = (ratio > _WILD) | (ratio < 1 / _WILD)
+    if wild.any():
+        warnings.warn(
+            f'{path}: in {wild.sum()} of {wild.size} nodes the PSF is '
+            f'{np.nanmin(ratio):.2g} to {np.nanmax(ratio):.2g} times as wide '
+            'as at the typical star: no stars tell what it is there; give a '
+            'lower --degree, such as 1', UserWarning, stacklevel=2)

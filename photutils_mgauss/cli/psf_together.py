@@ -6,6 +6,7 @@ from photutils_mgauss.cli import tools
 from photutils_mgauss.cli.progress import Progress
 from photutils_mgauss.cli.psf_stars import (
     check_image,
+    check_nodes,
     choose,
     fit_options,
     no_stars,
@@ -82,6 +83,7 @@ def _grid(options, fit, i):
     field, places = fit()
     exposure = places.get(i) if len(places) > 1 else None
     grid = field.to_grid(tuple(options.grid_shape), exposure=exposure)
+    check_nodes(options.inputs[i], grid, field.stars[field.stars['used']])
     record = tools.record_of(
         options, input=str(options.inputs[i]), kind='image',
         n_stars=int(field.stars['used'].sum()),

@@ -119,7 +119,7 @@ def test_info_says_whose_star_list_a_file_is(folder, capsys):
         assert f'{name}: a star list of {program}, 2 stars' in said
     assert 'the centre of the first pixel is (0, 0); DOLPHOT calls it' in said
     assert 'photon noise of a star whose FWHM is 2 pix' in said
-    assert said.count('mgauss motions with --wcs or --plane and --time') == 8
+    assert said.count('motions takes it with --wcs or --plane and --time') == 8
     assert 'of its image: no WCS, time unknown' in said
 
 

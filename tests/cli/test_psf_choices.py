@@ -1,12 +1,15 @@
 """``mgauss psf`` on files with several PSFs."""
 import gzip
+import warnings
 
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.table import QTable
 
-from photutils_mgauss import GriddedMixturePSF
+from photutils_mgauss import GaussianMixture, GriddedMixturePSF
 from photutils_mgauss.cli import main
+from photutils_mgauss.cli.psf_stars import check_nodes
 
 STEPS = np.arange(-20, 21) / 4
 
@@ -79,3 +82,18 @@ def test_a_choice_that_there_is_not_is_refused(tmp_path, capsys):
     assert main(['psf', str(tmp_path / 'a.fits'), '--quiet', '--output',
                  str(tmp_path / 'out.fits'), '--detector', '3']) == 1
     assert 'got 3' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('widest', 'warns'), [(2.0, False), (30.0, True)])
+def test_nodes_that_no_star_tells_are_warned_of(widest, warns):
+    mixtures = [GaussianMixture([1], [[0, 0]], [np.eye(2) * variance])
+                for variance in (2.0, 2.0, 2.0, widest)]
+    grid = GriddedMixturePSF(mixtures, [(0, 0), (99, 0), (0, 99), (99, 99)])
+    stars = QTable({'x': [3.0, 90.0, 7.0], 'y': [5.0, 8.0, 90.0]})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('always')
+        check_nodes('a.fits', grid, stars)
+    assert [str(one.message).partition(' the ')[0] for one in caught] == (
+        ['a.fits: in 1 of 4 nodes'] if warns else [])
+    if warns:
+        assert '1 to 3.9 times as wide' in str(caught[0].message)

@@ -53,7 +53,7 @@ def write_lis(name, xy, year):
         for n, (x, y) in enumerate(xy)))
 
 
-def write_ldac(name, xy, header):
+def write_ldac(name, xy, header, flags):
     text = header.tostring(sep='', endcard=True, padding=False)
     cards = np.array([[text[i:i + 80] for i in range(0, len(text), 80)]])
     head = fits.BinTableHDU.from_columns([fits.Column(
@@ -63,6 +63,7 @@ def write_ldac(name, xy, header):
         ('X_IMAGE', xy[:, 0] + 1), ('Y_IMAGE', xy[:, 1] + 1),
         ('ERRX2_IMAGE', np.full(len(xy), ERRORS[0]**2)),
         ('ERRY2_IMAGE', np.full(len(xy), ERRORS[1]**2)))]
+    columns.append(fits.Column('FLAGS', 'I', array=flags))
     fits.HDUList([fits.PrimaryHDU(), head, fits.BinTableHDU.from_columns(
         columns, name='LDAC_OBJECTS')]).writeto(name)
 
@@ -84,11 +85,17 @@ def check_motions(folder, stars, sign, scale):
 
 def test_motions_of_lists_with_header_need_no_options(stars, rng, capsys):
     for year in YEARS:
-        write_ldac(f'{year}.ldac', seen(stars, year, rng), tangent(year))
+        xy, flags = seen(stars, year, rng), np.zeros(len(stars[0]), int)
+        # A truncated star beside those with neighbours.
+        xy, flags = np.append(xy, [[3, 3 + year % 7]], axis=0), np.append(
+            flags, 16)
+        flags[:9] = 3
+        write_ldac(f'{year}.ldac', xy, tangent(year), flags)
     assert main(['motions', '--transform', 'shift',
                  *(f'{year}.ldac' for year in YEARS)]) == 0
     said = capsys.readouterr().out
-    assert ('2016.5.ldac: 60 stars, a star list of SExtractor: the centre of '
+    assert '2016.5.ldac: left out 1 of 61 stars, which SExtractor' in said
+    assert ('2016.5.ldac: 61 stars, a star list of SExtractor: the centre of '
             'the first pixel is (0, 0); SExtractor calls it (1, 1)') in said
     check_motions('mgauss_motions', stars, -1, SCALE)
 
