@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import scipy
+from astropy.utils import minversion
 from scipy.special import log_ndtr, ndtri
 from scipy.stats import qmc
 
@@ -26,6 +28,8 @@ _POINTS = 128
 _WIDE = 2.0, 1.3
 _KEPT = 0.05
 
+# SciPy's name for where random numbers come from.
+_SOURCE = 'rng' if minversion(scipy, '1.15') else 'seed'
 # By what part of a flux the fluxes of a band may scatter.
 _SCATTER = 0.0, 0.1, 0.3, 1.0
 
@@ -225,5 +229,5 @@ def _moments(places, weight):
 @cache
 def _points(size, seed):
     """Return evenly spread points (s, size) of a Gaussian."""
-    return ndtri(qmc.Sobol(size, rng=np.random.default_rng(seed)).random(
-        _POINTS))
+    source = {_SOURCE: np.random.default_rng(seed)}
+    return ndtri(qmc.Sobol(size, **source).random(_POINTS))
