@@ -84,7 +84,7 @@ def _evidence(tile, threshold):
 
 def _planes(model, psf_error):
     """Return weights that know of errors of the PSF, and its light."""
-    light = psf_error * np.maximum(model.star_light(), 0)
+    light = model.doubtful_light(psf_error)
     return np.divide(model.weight, 1 + model.weight * light**2), light
 
 

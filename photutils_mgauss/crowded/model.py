@@ -31,6 +31,9 @@ _WING_NOISE = 0.2
 # Of a star drawn afresh, Gaussians are left out where they fall below this
 # fraction of the noise.
 _FAINTEST = 1e-3
+# Of saturated stars only the wings are seen, which the PSF knows so many times
+# less well.
+_WING_DOUBT = 5
 
 
 class Model:
@@ -186,11 +189,11 @@ class Model:
         kernels.star_stamps(chosen, self.stars.sources, self.stamps,
                             self.gaussians, kernels.Tiling.empty(widest))
 
-    def _add_stars(self, chosen, sign):
+    def _add_stars(self, chosen, sign, image=None):
+        image = self.residual if image is None else image
         kernels.add_stars(chosen, sign, self.stars.sources, self.stamps,
                           self.wing, self.gaussians, _FAINTEST * self.noise,
-                          kernels.WingScratch.empty(self.residual.shape[1]),
-                          self.residual)
+                          kernels.WingScratch.empty(image.shape[1]), image)
 
     def background(self):
         """Return the image of the background, diffuse light included."""
@@ -214,6 +217,14 @@ class Model:
     def star_light(self):
         """Return the image of the stars alone."""
         return self.data - self.residual - self.background()
+
+    def doubtful_light(self, psf_error):
+        """Return the image of what errors of the PSF make of the stars."""
+        light = self.star_light()
+        seeded = np.flatnonzero(self.stars.seeded)
+        if seeded.size:
+            self._add_stars(seeded, float(_WING_DOUBT), light)
+        return psf_error * np.maximum(light, 0)
 
     def _weigh(self):
         if self.options.gain is not None:

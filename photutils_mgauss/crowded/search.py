@@ -46,7 +46,7 @@ def _scores(tile, threshold):
     ny, nx = model.data.shape
     significance = np.zeros((ny, nx))
     flux = np.zeros((ny, nx))
-    light = tile.options.psf_error * np.maximum(model.star_light(), 0)
+    light = model.doubtful_light(tile.options.psf_error)
     weight = np.divide(model.weight, 1 + model.weight * light**2)
     for j, i in np.ndindex(templates.stamps.shape[:2]):
         kernels.score(

@@ -14,9 +14,9 @@ SKY, FULL, FLUX, TOP = 40.0, 6e4, 2.5e6, 34.8
 ANGLES = 0.3 + 2 * np.pi * np.arange(5) / 5
 
 
-def mixture(piece):
+def mixture(piece, radius=3):
     """Return a PSF with five pieces of light around it, as on a ring."""
-    places = 3 * np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
+    places = radius * np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
     widths = 0.9, 3.5, *[0.5] * 5
     return GaussianMixture([0.75, 0.25 - 5 * piece, *[piece] * 5],
                            [(0, 0), (0, 0), *places],
@@ -26,10 +26,10 @@ def mixture(piece):
 PSF = GriddedMixturePSF([mixture(0)], [(0, 0)])
 
 
-def scene(stars, piece=0.003, seed=0):
+def scene(stars, piece=0.003, seed=0, radius=3):
     """Return an image and its errors: stars of a PSF that is not known."""
     rng = np.random.default_rng(seed)
-    light = SKY + sum(mixture(piece).render((70, 70), x, y, flux=flux)
+    light = SKY + sum(mixture(piece, radius).render((70, 70), x, y, flux=flux)
                       for x, y, flux in stars)
     seen = np.minimum(rng.normal(light, np.sqrt(light)), FULL)
     return seen, np.sqrt(light)
@@ -51,6 +51,17 @@ def test_what_the_psf_leaves_of_a_saturated_star_does_not_push_it(seed):
     assert abs(star['x_fit'] - x) < 0.01
     assert abs(star['y_fit'] - TOP) < 0.01
     assert star['flux_fit'] == pytest.approx(FLUX, rel=0.03)
+
+
+@pytest.mark.parametrize('seed', [0, 3])
+def test_what_the_psf_leaves_in_bright_wings_is_no_star(seed):
+    # Pieces that the noise lets stand out ten standard errors.
+    data, error = scene([(35, TOP, 4 * FLUX)], 2e-4, seed, radius=5)
+    phot = CrowdedMixturePhotometry(PSF, saturation=FULL - 500)
+    assert len(phot(data, error=error)) == 1
+    # Who says that the PSF has no errors gets all that it leaves.
+    phot = CrowdedMixturePhotometry(PSF, saturation=FULL - 500, psf_error=0)
+    assert len(phot(data, error=error)) > 2
 
 
 def test_a_star_that_is_too_bright_for_that_is_found():
