@@ -11,7 +11,7 @@ from photutils_mgauss.fitting.node_images import (
     of_psfex,
 )
 from photutils_mgauss.fitting.nodes import fit_nodes
-from photutils_mgauss.fitting.phases import FLUX_LIMIT
+from photutils_mgauss.fitting.phases import FLUX_LIMIT, SHIFT_LIMIT
 from photutils_mgauss.psf.grid import check_lattice, make_grid
 from photutils_mgauss.utils.waiting import waiting
 
@@ -61,9 +61,10 @@ def fit_node_images(nodes, n_components, *, scaled=True, **kwargs):
 
 
 def _warn_of_phases(report, n_components):
-    """Warn of fluxes that change with the place of a star in its pixel."""
-    errors = report['flux_phase_error']
-    n = np.count_nonzero(errors > FLUX_LIMIT)
+    """Warn of stars that change with their place in the pixel."""
+    errors, shifts = report['flux_phase_error'], report['phase_error']
+    n, n_shifts = (np.count_nonzero(values > limit) for values, limit in (
+        (errors, FLUX_LIMIT), (shifts, SHIFT_LIMIT)))
     if n:
         warnings.warn(
             f'fluxes measured with these mixtures of {n_components} Gaussians '
@@ -73,3 +74,11 @@ def _warn_of_phases(report, n_components):
             "flux_phase_error of the report); more Gaussians or "
             "weighting='photometric' make this smaller", AstropyUserWarning,
             stacklevel=5)
+    if n_shifts:
+        warnings.warn(
+            'positions measured with these mixtures change with the place of '
+            f'a star in its pixel by up to {np.nanmax(shifts):.4f} pix, by '
+            f'more than {SHIFT_LIMIT} pix at {n_shifts} of {len(report)} '
+            'nodes (column phase_error of the report), which the errors of '
+            "stars do not include; more Gaussians or weighting='astrometric' "
+            'make this smaller', AstropyUserWarning, stacklevel=5)

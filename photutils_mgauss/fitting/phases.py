@@ -14,6 +14,8 @@ _MIN_PHASES = 4
 _LEAST_LIGHT = 1e-3
 # Fluxes that change more than this with the pixel phase are said [rms].
 FLUX_LIMIT = 0.003
+# So are positions [pix]: the brightest stars are measured better.
+SHIFT_LIMIT = 0.002
 # Fluxes are those in stamps of so many native pixels. The variance of a
 # bright star's pixels has a floor of this share of its peak.
 _FLUX_SIZE = 5
