@@ -57,6 +57,7 @@ def test_images_of_any_sampling_are_the_same_function(empirical):
     assert_allclose(four[::2, ::2], two, atol=1e-12)
 
 
+@pytest.mark.filterwarnings('ignore:positions measured with these mixtures')
 def test_it_becomes_a_photutils_grid_and_mixtures(empirical):
     grid = empirical.to_gridded_psf((2, 2))
     assert_allclose(grid.grid_xypos[-1], [259, 219])

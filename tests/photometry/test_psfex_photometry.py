@@ -1,5 +1,6 @@
 """A PSFEx model of a real chip as a grid of mixtures, inside photutils."""
 import numpy as np
+import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 from photutils.psf import PSFPhotometry
@@ -21,6 +22,7 @@ def draw_star(model, x, y, half):
     return FLUX * stamp / plane.sum() / model.sampling**2
 
 
+@pytest.mark.filterwarnings('ignore:positions measured with these mixtures')
 def test_stars_of_a_psfex_model_are_measured_where_they_are(realdata, rng):
     (path,) = realdata('decam_psfex').glob('DECam_00241238_01_*deg2.psf')
     model = read_psfex(path)

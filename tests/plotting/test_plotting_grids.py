@@ -66,6 +66,7 @@ def test_whiskers_point_along_the_long_axis(ax):
     assert_allclose(ends.mean(axis=1), psf.grid_xypos)
 
 
+@pytest.mark.filterwarnings('ignore:positions measured with these mixtures')
 @pytest.mark.filterwarnings('ignore:fluxes measured with these mixtures')
 def test_the_worst_node_is_shown_in_per_cent(ax):
     def spoil(data):
