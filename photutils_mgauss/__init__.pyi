@@ -976,7 +976,7 @@ def fit_crowded_psf(
     n_components: int = 6, degree: int | Literal['auto'] = 'auto',
     radius: float = 15, max_stars: int = 300, min_snr: float = 50,
     saturation: float | None = None, effective_gain: float | None = None,
-    background_size: float | None = 64, max_passes: int = 12,
+    background_size: float | None = 64, max_passes: int = 20,
     executor: Executor | None = None,
     checkpoint: str | PathLike[str] | None = None, progress_bar: bool = False,
 ) -> MixtureField: ...
