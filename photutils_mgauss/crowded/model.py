@@ -31,8 +31,8 @@ _WING_NOISE = 0.2
 # Of a star drawn afresh, Gaussians are left out where they fall below this
 # fraction of the noise.
 _FAINTEST = 1e-3
-# Of saturated stars only the wings are seen, which the PSF knows so many times
-# less well.
+# Of saturated stars only the wings are seen, where the PSF is less certain:
+# their light counts so many times more.
 _WING_DOUBT = 5
 
 

@@ -107,7 +107,7 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         The number K of Gaussians; 'auto' chooses the number from 2 to 7
         that best describes stars left out of the fit. By default it is
         'auto' with 8 to 59 stars, and else 6; with 60 stars or more it
-        becomes 8, in twice the time, where 6 miss 0.5 % of the light of
+        becomes 8, in three times the time, where 6 miss 0.5 % of the light of
         bright pixels and stars are not so narrow that pixels are
         integrated.
     degree : int or 'auto', optional

@@ -425,7 +425,7 @@ class _Lower(Lower):
 
     numba keeps on the stack what is used in more than one block of code, named
     tuples of arrays too, and puts all of it together again wherever a part is
-    used. What is assigned once needs no place there: half of the code less.
+    used. What is assigned once needs no place there.
     """
 
     def _find_singly_assigned_variable(self):
