@@ -5,12 +5,15 @@ Candidates are fitted to all stars. From there each part of the stars in turn
 is left out, the shapes are fitted to the others, and what they say of those
 left out, whose positions and fluxes are fitted, is the score.
 """
+import logging
+
 import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.normal import equations, optimise
 
+_LOG = logging.getLogger('photutils_mgauss')
 DEGREES = (0, 1, 2, 3, 4, 5)
 COMPONENTS = (2, 3, 4, 5, 6, 7)
 # What is taken without a choice, and from how few to how many stars there is
@@ -24,7 +27,7 @@ _FIRST_COMPONENTS = 5
 # What many stars get where the usual number leaves more than this share of the
 # light of a pixel unexplained, as strong aberrations do. It is the noise of
 # 40,000 electrons: with less missing, the noise of all but the brightest
-# stars' peaks is larger, and more Gaussians take twice the time for nothing.
+# stars' peaks is larger, and more Gaussians take more time for nothing.
 _MORE_COMPONENTS, _POOR = 8, 0.005
 # The fit without some stars starts where the one with all of them ended. It
 # must forget them: no damping.
@@ -53,35 +56,43 @@ def full_degree(degree):
     return max(degree + 1, _USUAL_DEGREE)
 
 
-def with_enough_components(fit, problem, strength, workers, *, reject=True):
+def run_with_enough_components(problem, degree, workers, *, strength=1.0,
+                               reject=True):
     """
-    Return a fit of more Gaussians where the usual number is too few.
+    Fit the usual number of Gaussians to many stars, or more if need be.
+
+    Whether it is too few is known before that fit is finished.
 
     Parameters
     ----------
-    fit : FieldFit
-        Of the usual number of Gaussians to many stars.
     problem : FieldProblem
-        What it was fitted to.
-    strength : float
-        Of the prior.
+    degree : int
     workers : Workers
+    strength : float, optional
+        Of the prior.
     reject : bool, optional
         Whether to drop deviant stars and pixels.
 
     Returns
     -------
     FieldFit
-        The same one if all is well, or more Gaussians err more.
+        Of more Gaussians only if these err less.
     """
+    how = {'strength': strength, 'reject': reject}
+    fit = stages.run(problem, _USUAL_COMPONENTS, degree, workers,
+                     poor=_POOR, **how)
     if fit.accuracy < _POOR:
         return fit
-    degree = stages.term_degrees(len(fit.coefficients)
-                                 - fit.problem.n_extra)[-1]
     workers.tell(f'{_MORE_COMPONENTS} Gaussians')
     more = stages.run(problem, _MORE_COMPONENTS, degree, workers,
-                      strength=strength, reject=reject)
-    return more if more.accuracy < fit.accuracy else fit
+                      course=stages.BRISK, poor=fit.accuracy, **how)
+    if more.accuracy >= fit.accuracy:
+        return stages.finish(fit, workers, reject)
+    _LOG.info('%d Gaussians miss %.1f %% of the light in bright pixels: '
+              'the field has %d, which miss %.1f %%',
+              _USUAL_COMPONENTS, 100 * fit.accuracy,
+              _MORE_COMPONENTS, 100 * more.accuracy)
+    return more
 
 
 def choose(problem, n_components, degree, max_degree, strength, workers):

@@ -25,7 +25,7 @@ from photutils_mgauss.field.brighter_fatter import measure_fattening
 from photutils_mgauss.field.choice import (
     MANY_STARS,
     choose,
-    with_enough_components,
+    run_with_enough_components,
 )
 from photutils_mgauss.field.contexts import lateral_shifts
 from photutils_mgauss.field.covariance import honest_covariance
@@ -107,7 +107,7 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         The number K of Gaussians; 'auto' chooses the number from 2 to 7
         that best describes stars left out of the fit. By default it is
         'auto' with 8 to 59 stars, and else 6; with 60 stars or more it
-        becomes 8, in three times the time, where 6 miss 0.5 % of the light of
+        becomes 8, in twice the time, where 6 miss 0.5 % of the light of
         bright pixels and stars are not so narrow that pixels are
         integrated.
     degree : int or 'auto', optional
@@ -266,26 +266,10 @@ def _free_field(problem, sample, radius, n_components, degree, top, options,
     """Return the field of a PSF of which nothing is known."""
     problem.pixel_integrated = chosen_pixel(
         problem, options.pixel_integrated, options.regularization, workers)
-    fit, choice = _free(problem, n_components, degree, top, workers,
-                        options.regularization, options.reject)
-    if (options.n_components is None and len(problem.basis) >= MANY_STARS
-            and not problem.pixel_integrated):
-        fit = _with_enough(fit, problem, options, workers)
+    fit, choice = _free(problem, n_components, degree, top, workers, options)
     fit, fatter = _fatter(fit, options.brighter_fatter, workers,
                           options.reject)
     return _result(fit, sample, radius, choice, options.centre, fatter)
-
-
-def _with_enough(fit, problem, options, workers):
-    """Return the fit, of more Gaussians where the usual number is too few."""
-    more = with_enough_components(fit, problem, options.regularization,
-                                  workers, reject=options.reject)
-    if more is not fit:
-        _LOG.info('%d Gaussians miss %.1f %% of the light in bright pixels: '
-                  'the field has %d, which miss %.1f %%',
-                  fit.coefficients.shape[1], 100 * fit.accuracy,
-                  more.coefficients.shape[1], 100 * more.accuracy)
-    return more
 
 
 def _fatter(fit, wanted, workers, reject):
@@ -358,14 +342,20 @@ def with_light_beyond(field, wings):
                    wing_stddev=wings.stddev, wing_error=wings.error)
 
 
-def _free(problem, n_components, degree, top, workers, strength, reject):
+def _free(problem, n_components, degree, top, workers, options):
     """Return the fit, and the table of what was tried for it."""
-    few = degree == 'auto' and len(problem.basis) < MANY_STARS
+    many = len(problem.basis) >= MANY_STARS
+    few = degree == 'auto' and not many
+    strength, reject = options.regularization, options.reject
     n_components, degree, choice = choose(
         problem, n_components, degree if degree == 'auto' else top, top,
         strength, workers)
-    fit = stages.run(problem, n_components, degree, workers,
-                     strength=strength, reject=reject)
+    if options.n_components is None and many and not problem.pixel_integrated:
+        fit = run_with_enough_components(problem, degree, workers,
+                                         strength=strength, reject=reject)
+    else:
+        fit = stages.run(problem, n_components, degree, workers,
+                         strength=strength, reject=reject)
     if few:
         fit = add_degrees(fit, problem.basis, degree, workers, reject=reject)
     if problem.pixel_integrated:

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.rows import kernel_rows_of_logs
@@ -195,41 +196,45 @@ def equations(problem, coefficients, workers):
         problem.sources, problem.anchors, problem.hold, problem.n_sources,
         problem.sky, problem.used)
     workers.tell()
-    matrix = _unpacked(sum(part.matrix for part in parts),
-                       problem.basis.shape[1])
-    return Equations(matrix, sum(part.right for part in parts),
-                     np.concatenate([part.chi2 for part in parts]),
-                     np.concatenate([part.sources for part in parts]),
-                     np.concatenate([part.sky for part in parts]))
+    own, *numbers = (np.concatenate(columns)
+                     for columns in zip(*parts, strict=True))
+    return Equations(*_spread(own, problem.basis), *numbers)
 
 
-def _unpacked(pairs, n_terms):
-    """Return the matrix of pairs of numbers and pairs of terms."""
-    rows, columns = (_triangle(n) for n in (_order(len(pairs)), n_terms))
-    full = pairs[:, columns][rows].transpose(0, 2, 1, 3)
-    size = len(rows) * n_terms
-    return full.reshape(size, size)
+def _spread(own, basis):
+    """
+    Return matrix and right side of all coefficients.
+
+    ``own`` (n, P (P + 3) / 2) are the equations of stars' shapes, as in
+    `kernels.FieldSums`: sums of their products with pairs of terms are one
+    product of matrices.
+    """
+    n_terms = basis.shape[1]
+    n = (int(np.sqrt(8 * own.shape[1] + 9)) - 3) // 2
+    first, second = np.triu_indices(n_terms)
+    pairs = own.T @ (basis[:, first] * basis[:, second])
+    place, of_terms = _triangle(n, 1), _triangle(n_terms)
+    ends = place[:, -1]
+    place = np.maximum(place[:, :-1], place[:, :-1].T)
+    matrix = pairs[place[:, None, :, None], of_terms[:, None]]
+    return (matrix.reshape(n * n_terms, -1), (own[:, ends].T @ basis).ravel())
 
 
-def _order(n):
-    """Return the order of a matrix with n elements in its triangle."""
-    return (int(np.sqrt(8 * n + 1)) - 1) // 2
+def _triangle(n, more=0):
+    """
+    Return where the elements (n, n) of a symmetric matrix are kept.
 
-
-def _triangle(n):
-    """Return where the elements (n, n) of a symmetric matrix are kept."""
-    place = np.zeros((n, n), int)
-    place[np.triu_indices(n)] = np.arange(n * (n + 1) // 2)
-    return np.maximum(place, place.T)
+    Its upper triangle is, with ``more`` columns behind it.
+    """
+    place = np.zeros((n, n + more), int)
+    kept = np.triu_indices(n, 0, n + more)
+    place[kept] = np.arange(kept[0].size)
+    return place if more else np.maximum(place, place.T)
 
 
 @dataclass
 class _PartEquations:
-    """
-    The kernel's call for some of the stars, picklable for processes.
-
-    Its matrices are those of `kernels.FieldSums`.
-    """
+    """The kernel's call for some of the stars, picklable for processes."""
 
     coefficients: np.ndarray
     fit_sky: bool
@@ -238,27 +243,24 @@ class _PartEquations:
 
     def __call__(self, data, weights, corners, basis, local, sources,
                  anchors, hold, n_sources, sky, used):
-        right = np.zeros(to_vector(self.coefficients).size)
-        n_terms = basis.shape[1]
-        total = np.zeros([n * (n + 1) // 2 for n in (right.size // n_terms,
-                                                     n_terms)])
+        n = to_vector(self.coefficients).size // basis.shape[1]
+        own = np.zeros((len(data), n * (n + 3) // 2))
         chi2 = np.empty(len(data))
         sources, sky = sources.copy(), sky.copy()
         for first in range(0, len(data), _CHUNK):
             part = slice(first, first + _CHUNK)
             now = self.coefficients, basis[part], local[part]
             rows = kernel_rows_of_logs(*self.form.shapes(*now))
-            n = 3 * sources.shape[1] + 6 * rows.shape[1] - 1
+            size = 3 * sources.shape[1] + 6 * rows.shape[1] - 1
             stars = kernels.FieldStars(*(column[part] for column in (
                 data, weights, corners, sources, anchors, hold, n_sources,
                 sky, used)))
             kernels.field_normal(
-                stars, kernels.FieldShapes(basis[part], rows,
-                                           self.form.jacobians(*now),
+                stars, kernels.FieldShapes(rows, self.form.jacobians(*now),
                                            self.integrated),
-                self.fit_sky, _SETTLE_STEPS, np.empty((n, n)),
-                kernels.FieldSums(total, right, chi2[part]))
-        return Equations(total, right, chi2, sources, sky)
+                self.fit_sky, _SETTLE_STEPS, np.empty((size, size)),
+                kernels.FieldSums(own[part], chi2[part]))
+        return own, chi2, sources, sky
 
 
 def model_stamps(problem, coefficients):
@@ -437,7 +439,9 @@ def _damped_step(matrix, right, damping):
     scale = np.sqrt(np.diag(matrix))
     scaled = matrix / scale / scale[:, None]
     scaled[np.diag_indices_from(scaled)] += damping
-    # Not LAPACK: its own threads wait for each other on a busy machine.
-    step = np.empty(right.size)
-    kernels.solve(np.column_stack([scaled, right / scale]), step)
+    _, step, failed = dposv(scaled, right / scale)
+    if failed:
+        # Rounding has left it a negative direction.
+        step = np.empty(right.size)
+        kernels.solve(np.column_stack([scaled, right / scale]), step)
     return step / scale

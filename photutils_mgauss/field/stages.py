@@ -35,8 +35,6 @@ _ALLOWANCE = 0.03
 _STAR_LIMIT = 6.0
 _STAR_EXCESS = 0.3
 _MAX_DEVIANT_PIXELS = 0.1
-# How often the prior takes the widths of the coefficients found under it.
-_ADAPTATIONS = 3
 # Of a unit pixel along either axis [pix^2].
 PIXEL_VARIANCE = 1 / 12
 # Relative error of the PSF assumed before anything is known of it, and at
@@ -47,6 +45,26 @@ _FIRST_ACCURACY = 0.1
 # star's flux. The many faint pixels of rings would otherwise decide what the
 # Gaussians are, at the cost of the core, which has the positions.
 _LACK = 1e-3
+
+
+class Course(NamedTuple):
+    """
+    How a fit gets to the last degree, and when it ends there.
+
+    Only ``degrees`` are fitted on the way, or all. The prior takes the widths
+    of the coefficients found under it ``adaptations`` times, each time until
+    a step gains less than ``tolerance`` per star.
+    """
+
+    degrees: tuple = None
+    adaptations: int = 3
+    tolerance: float = 0.01
+
+
+CAREFUL = Course()
+# Where passes are long, as with many Gaussians, every other degree is enough
+# to find the way.
+BRISK = Course((0, 2), 2, 0.05)
 
 
 @dataclass
@@ -373,20 +391,24 @@ def not_deviant(reduced, used):
     return reduced <= limit
 
 
-def run(problem, n_components, degree, workers, *, strength=1.0, reject=True):
+def run(problem, n_components, degree, workers, *, strength=1.0, reject=True,
+        course=CAREFUL, poor=np.inf):
     """
     Fit the field, raising the degree from 0.
 
-    ``problem.basis`` holds the terms of ``degree``. Returns a `FieldFit`.
+    ``problem.basis`` holds the terms of ``degree``. Returns a `FieldFit`,
+    which is not finished (see `finish`) if its accuracy is ``poor`` or worse.
     """
     state = _first_state(problem, n_components, degree, strength, workers)
     brightest = np.argsort(-problem.sources[:, 0, 2])
     for low in range(degree + 1):
+        if course.degrees is not None and low not in course.degrees:
+            continue
         count = _STARS_PER_TERM * n_terms(low + 1)
         if low == degree and count >= len(brightest):
             break
         _stage(state, np.sort(brightest[:count]), low, workers, reject)
-    return _finish(state, degree, workers, reject)
+    return _finish(state, degree, workers, reject, course, poor)
 
 
 def degrees(problem, n_components, top, strength, workers):
@@ -491,25 +513,39 @@ def tune(problem, degree, workers, *, strength=1.0, reject=True):
     return _finish(state, degree, workers, reject)
 
 
-def _finish(state, degree, workers, reject):
+def _finish(state, degree, workers, reject, course=CAREFUL, poor=np.inf):
     terms = n_terms(degree)
     state.problem = state.problem.with_terms(terms)
     state.coefficients = raised(state.coefficients, terms,
                                  state.problem.n_extra)
-    return polish(state, workers, reject)
+    return polish(state, workers, reject, course=course, poor=poor)
 
 
-def polish(state, workers, reject):
-    """Fit all at the last degree until nothing changes; return the state."""
+def polish(state, workers, reject, *, course=CAREFUL, poor=np.inf):
+    """
+    Fit all at the last degree until nothing changes; return the state.
+
+    Not until then if its accuracy, once that is known, is ``poor`` or worse.
+    """
     workers.tell('all stars')
     _settle_all(state, workers)
-    for share, tolerance in ((0.3, 0.3), (0.3, 0.1), (1, 0.01)):
+    for tolerance in (0.3, 0.1):
         _fit_blurs(state, workers)
-        weigh(state, reject=reject, share=share)
+        weigh(state, reject=reject, share=0.3)
         advance(state, workers, tolerance=tolerance, max_steps=8)
+    _fit_blurs(state, workers)
+    weigh(state, reject=reject)
+    return (finish(state, workers, reject, course) if state.accuracy < poor
+            else state)
+
+
+def finish(state, workers, reject, course=CAREFUL):
+    """Fit all at the last weights and let the prior adapt to them."""
+    advance(state, workers, tolerance=0.01, max_steps=8)
     workers.tell('shrinkage')
-    for _ in range(_ADAPTATIONS if len(state.coefficients) > 1 else 0):
-        _adapt(state, workers, reject)
+    several = len(state.coefficients) > 1
+    for _ in range(course.adaptations if several else 0):
+        _adapt(state, workers, reject, course.tolerance)
     return state
 
 
@@ -528,7 +564,7 @@ def with_errors(state, misfit, workers):
     return plain
 
 
-def _adapt(state, workers, reject):
+def _adapt(state, workers, reject, tolerance=CAREFUL.tolerance):
     """Let the prior follow the coefficients, and these the prior."""
     state.prior = state.prior.adapted(
         state.coefficients, state.equations.matrix,
@@ -536,7 +572,7 @@ def _adapt(state, workers, reject):
                 state.problem.n_extra))
     # A higher error would mean less weight for the cores, and so on upwards.
     weigh(state, reject=reject, share=None)
-    advance(state, workers, tolerance=0.01, max_steps=10)
+    advance(state, workers, tolerance=tolerance, max_steps=10)
 
 
 def _groups(coefficients, kinds, n_extra):

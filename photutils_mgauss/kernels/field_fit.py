@@ -50,13 +50,11 @@ class FieldShapes(NamedTuple):
     """
     The PSF of each of n stars, rows (n, K, 6), and what it depends on.
 
-    basis (n, T), the polynomials at the star; jacobians (n, 6 K - 3, P), the
-    derivatives of its shapes by the P numbers that are polynomials, or
-    (0, 0, 0) if they are the shapes themselves; integrated, whether the rows
-    are integrated over pixels, not sampled.
+    jacobians (n, 6 K - 3, P), the derivatives of its shapes by the P numbers
+    that are polynomials, or (0, 0, 0) if they are the shapes themselves;
+    integrated, whether the rows are integrated over pixels, not sampled.
     """
 
-    basis: np.ndarray
     rows: np.ndarray
     jacobians: np.ndarray
     integrated: bool
@@ -64,15 +62,14 @@ class FieldShapes(NamedTuple):
 
 class FieldSums(NamedTuple):
     """
-    Normal equations of a field, and chi2 (n,) of each star.
+    What n stars say of their P shapes, or of the numbers these depend on.
 
-    total (P (P + 1) / 2, T (T + 1) / 2) has a row for each pair of numbers
-    and a column for each pair of terms, as they come in an upper triangle;
-    gradient (P T,) orders unknowns by number, then term.
+    equations (n, P (P + 3) / 2) has the upper triangle of the normal
+    equations, each line of it followed by its right side; those of stars that
+    are not used do not change. chi2 (n,) is that of each star.
     """
 
-    total: np.ndarray
-    gradient: np.ndarray
+    equations: np.ndarray
     chi2: np.ndarray
 
 
@@ -310,18 +307,17 @@ def _settle(i, stars, psf, fit_sky, with_shapes, scratch, normal, step):
 @kernel(allocates=True)
 def field_normal(stars, shapes, fit_sky, n_steps, normal, sums):
     """
-    Settle n stars and add the equations of the used ones to sums.
+    Settle n stars and put the equations of the used ones into sums.
 
     Each star's own numbers take n_steps Gauss-Newton steps, the PSF given;
     the last one is taken together with the equations of the shapes, so that
     chi2 and gradient are those after it. sources and, with fit_sky, sky of
     the stars change. normal is scratch (D, D) with D = 3 M + 6 K - 1.
     """
-    basis, rows, jacobians, integrated = shapes
-    total, gradient, chi2 = sums
+    rows, jacobians, integrated = shapes
+    equations, chi2 = sums
     scratch = _scratch(normal.shape[0], stars.stamps.shape[2], integrated)
     step = np.empty(normal.shape[0])
-    squares = np.empty(total.shape[1])
     condensed = np.empty((jacobians.shape[2], jacobians.shape[2] + 1))
     for star in range(chi2.size):
         used = stars.used[star]
@@ -334,10 +330,9 @@ def field_normal(stars, shapes, fit_sky, n_steps, normal, sums):
             continue
         if jacobians.size:
             _condense(normal, own, size, jacobians[star], condensed)
-            _spread(condensed, 0, condensed.shape[1], basis[star], squares,
-                    total, gradient)
+            _pack(condensed, 0, condensed.shape[1], equations[star])
         else:
-            _spread(normal, own, size, basis[star], squares, total, gradient)
+            _pack(normal, own, size, equations[star])
 
 
 @inner(allocates=True)
@@ -362,29 +357,13 @@ def _condense(normal, own, size, jacobian, out):
 
 
 @inner
-def _spread(normal, own, size, basis, squares, total, gradient):
-    """Add A (x) B B^T to total, A being what is left of normal."""
-    n_terms = basis.size
+def _pack(normal, own, size, out):
+    """Put what is left of the upper triangle of normal into out."""
     at = 0
-    for t in range(n_terms):
-        for u in range(t, n_terms):
-            squares[at] = basis[t] * basis[u]
+    for p in range(own, size - 1):
+        for q in range(p, size):
+            out[at] = normal[p, q]
             at += 1
-    at = 0
-    for p in range(size - own - 1):
-        for q in range(p, size - own - 1):
-            _add_scaled(normal[own + p, own + q], squares, total[at])
-            at += 1
-        right = normal[own + p, size - 1]
-        for t in range(n_terms):
-            gradient[p * n_terms + t] += basis[t] * right
-
-
-@loop
-def _add_scaled(factor, values, out):
-    """Add values, times a factor, to out."""
-    for i in range(values.size):
-        out[i] += factor * values[i]
 
 
 @kernel
