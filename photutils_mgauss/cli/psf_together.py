@@ -72,9 +72,18 @@ def _fit(options, images):
         mask=[images[k].mask for k in some],
         effective_gain=gains.pop() if len(gains) == 1 else None, **fit)
     tools.say(options, f'{field.n_components} Gaussians, degree '
-              f'{field.degree}, from {int(field.stars["used"].sum())} stars '
-              f'of {len(some)} images')
+              f'{field.degree}, from {_told(field.stars)} of {len(some)} '
+              'images')
     return field, {k: place for place, k in enumerate(some)}
+
+
+def _told(stars):
+    """Return how many stars were used, and how often they were seen."""
+    used = stars[stars['used']]
+    n_stars = len(set(used['star'])) if 'star' in used.colnames else len(used)
+    words = f'{n_stars} stars'
+    return words if n_stars == len(used) else (
+        f'{len(used)} detections of {words}')
 
 
 def _grid(options, fit, i):

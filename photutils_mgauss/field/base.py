@@ -140,6 +140,7 @@ def star_table(fit, sample, centre_stddev):
     table['id'] = sample.row + 1
     if len(sample.reasons) > 1:
         table['exposure'] = sample.exposure
+        table['star'] = sample.star + 1
     table['x'], table['y'] = sample.expected()
     table['x_fit'], table['y_fit'], flux = _own_numbers(
         fit, centre_stddev).T

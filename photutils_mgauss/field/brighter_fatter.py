@@ -69,8 +69,8 @@ def measure_fattening(fit, workers):
     used = np.flatnonzero(fit.problem.used)
     flux = fit.fluxes()
     scale = float(max(flux[used].max(), 1e-300))
-    if used.size < _FEWEST_STARS or np.std(flux[used]) < (_LEAST_SPREAD
-                                                          * scale):
+    n_stars = np.unique(fit.problem.star[used]).size
+    if n_stars < _FEWEST_STARS or np.std(flux[used]) < _LEAST_SPREAD * scale:
         return None
     order = used[np.argsort(flux[used])]
     stars = order[np.linspace(0, order.size - 1, min(

@@ -133,8 +133,7 @@ def choose(problem, n_components, degree, max_degree, strength, workers):
 
 
 def _brightest(problem, n_stars):
-    order = np.argsort(-problem.sources[:, 0, 2])
-    return problem.subset(np.sort(order[:n_stars]))
+    return problem.subset(np.sort(problem.brightest()[:n_stars]))
 
 
 def _climb(score, first, steps):
@@ -196,10 +195,14 @@ def _fair(chi2):
 
 
 def _left_out(fit, workers):
-    """Return the reduced chi^2 of every star when it is left out."""
-    n = len(fit.problem.basis)
-    folds = np.arange(n) % n_folds(n)
-    chi2 = np.empty(n)
+    """
+    Return the reduced chi^2 of every star when it is left out.
+
+    All detections of a star are left out together, and count once.
+    """
+    stars, number = np.unique(fit.problem.star, return_inverse=True)
+    folds = number % n_folds(stars.size)
+    chi2 = np.empty(number.size)
     for fold in np.unique(folds):
         inside, outside = (fit.problem.subset(np.flatnonzero(rows))
                            for rows in (folds != fold, folds == fold))
@@ -208,7 +211,7 @@ def _left_out(fit, workers):
             max_steps=_FOLD_STEPS, tolerance=_FOLD_TOLERANCE,
             damping=_FOLD_DAMPING)
         chi2[folds == fold] = _settled(outside, coefficients, workers)
-    return chi2
+    return np.array([np.median(chi2[number == i]) for i in range(stars.size)])
 
 
 def _settled(problem, coefficients, workers):

@@ -23,8 +23,11 @@ and is drawn from a Gaussian of covariance
 
 where :math:`\tau^2 U_s` is what the deviations of the others do to the field
 at star s. The most likely :math:`\tau^2` is taken.
+
+Several exposures may show a star at one place. These detections share its
+deviation: s is then the place, with the sums of their equations.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -69,18 +72,36 @@ def honest_covariance(fit):
     """
     covariance = covariance_of(fit)
     scale = variation(fit)
-    used = np.flatnonzero(fit.problem.used)
-    if used.size < _FEWEST_STARS:
+    used = _by_place(fit.problem)
+    if len(used) < _FEWEST_STARS:
         return covariance, np.zeros(scale.size)
-    some = used[np.linspace(0, used.size - 1, min(
-        used.size, _MOST_STARS)).astype(int)]
-    stars = _left_out(fit, covariance, some)
+    some = np.linspace(0, len(used) - 1, min(len(used),
+                                             _MOST_STARS)).astype(int)
+    stars = _left_out(fit, covariance, [used[i] for i in some])
     spread = sum(np.kron((star.matrix * scale) @ star.matrix,
                          np.outer(star.basis, star.basis)) for star in stars)
-    spread *= used.size / some.size
+    spread *= len(used) / some.size
     share = _most_likely([star.whitened(scale, spread) for star in stars])
     added = covariance @ spread @ covariance
     return covariance + share * added, share * scale
+
+
+def with_all_detections(fit):
+    """Return the fit with the equations of all detections of a place."""
+    if fit.problem.n_places == len(fit.problem.place):
+        return fit
+    problem = replace(fit.problem, places_once=False)
+    with Workers() as workers:
+        return replace(fit, problem=problem, equations=equations(
+            problem, fit.coefficients, workers))
+
+
+def _by_place(problem):
+    """Return the detections that are used, a list for each place."""
+    used = np.flatnonzero(problem.used)
+    order = used[np.argsort(problem.place[used], kind='stable')]
+    edges = np.flatnonzero(np.diff(problem.place[order])) + 1
+    return np.split(order, edges) if used.size else []
 
 
 def variation(fit):
@@ -95,7 +116,7 @@ def variation(fit):
 @dataclass
 class _LeftOut:
     """
-    A star left out of the fit.
+    A star left out of the fit, with all its detections at one place.
 
     Attributes
     ----------
@@ -139,8 +160,10 @@ def _left_out(fit, covariance, stars):
     found = []
     with Workers() as workers:
         for star in stars:
-            basis = fit.problem.basis[star]
-            matrix, gradient = _own_equations(fit, star, workers)
+            # The detections of one place differ little in theirs.
+            basis = fit.problem.basis[star].mean(axis=0)
+            matrix, gradient = map(sum, zip(*(_own_equations(
+                fit, one, workers) for one in star), strict=True))
             size = len(matrix)
             # M^-1 B, and without this star by Woodbury's identity.
             towards = covariance.reshape(-1, size, basis.size) @ basis

@@ -28,7 +28,10 @@ from photutils_mgauss.field.choice import (
     run_with_enough_components,
 )
 from photutils_mgauss.field.contexts import lateral_shifts
-from photutils_mgauss.field.covariance import honest_covariance
+from photutils_mgauss.field.covariance import (
+    honest_covariance,
+    with_all_detections,
+)
 from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.growth import (
     FIRST_RADIUS,
@@ -84,7 +87,10 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
 
     If you give lists for ``data``, ``stars``, ``error`` and ``mask``,
     several exposures of one detector share a field; the PSF of each
-    exposure is the field convolved with its own Gaussian.
+    exposure is the field convolved with its own Gaussian. Stars that
+    several exposures show at about the same place, as after small dithers,
+    count once where the number of stars decides, and are left out
+    together. The pattern of the stars tells which they are.
 
     Parameters
     ----------
@@ -226,8 +232,8 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         sample, radius = _read(given, options)
         if options.correlated_noise:
             allow_for_correlation(sample)
-        n_components, degree = options.size(len(sample.row))
-        top = possible_degree(degree, len(sample.row))
+        n_components, degree = options.size(sample.n_places)
+        top = possible_degree(degree, sample)
         problem = sample.problem(top, options.local_bkg)
         with Workers(executor) as workers, progress(workers, progress_bar):
             if start is not None:
@@ -344,7 +350,7 @@ def with_light_beyond(field, wings):
 
 def _free(problem, n_components, degree, top, workers, options):
     """Return the fit, and the table of what was tried for it."""
-    many = len(problem.basis) >= MANY_STARS
+    many = problem.n_places >= MANY_STARS
     few = degree == 'auto' and not many
     strength, reject = options.regularization, options.reject
     n_components, degree, choice = choose(
@@ -397,6 +403,7 @@ def _tuned(fit, sample, start, radius, centre):
 
 def _errors(fit, sample):
     """Return the covariance of coefficients, and what is not modelled."""
+    fit = with_all_detections(fit)
     covariance, unmodelled = honest_covariance(fit)
     if fit.lack or any(sample.correlations):
         covariance = covariance + (noise_covariance(

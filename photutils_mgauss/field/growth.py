@@ -107,12 +107,18 @@ def _half_radius(stamps):
 
 
 def stars_of_exposures(field, n):
-    """Return x, y and flux (n, 3) of the stars used of each exposure."""
+    """
+    Return x, y, flux and number (n, 4) of the stars used of each exposure.
+
+    The number of a star is the same in all exposures.
+    """
     table = field.stars[field.stars['used']]
-    exposure = (np.asarray(table['exposure'])
-                if 'exposure' in table.colnames else np.zeros(len(table)))
+    several = 'exposure' in table.colnames
+    exposure = np.asarray(table['exposure']) if several else np.zeros(
+        len(table))
+    number = table['star'] if several else np.arange(len(table))
     stars = np.column_stack([table['x_fit'], table['y_fit'],
-                             plain_values(table['flux_fit'])])
+                             plain_values(table['flux_fit']), number])
     return [stars[exposure == i] for i in range(n)]
 
 
@@ -161,8 +167,8 @@ def measure_wings(exposures, catalogues, stars, inside, radius):
     exposures : iterable of PixelData
     catalogues : list of Sources
         All sources of each exposure; pixels near others are left out.
-    stars : list of (n, 3) `~numpy.ndarray`
-        x, y and flux of the stars of each exposure that are used.
+    stars : list of (n, 4) `~numpy.ndarray`
+        x, y, flux and number of the stars of each exposure that are used.
     inside : (float, float)
         The light inside the stamps, in fluxes of the stars, and its error.
     radius : float
@@ -178,9 +184,9 @@ def measure_wings(exposures, catalogues, stars, inside, radius):
     edges = np.geomspace(radius + 0.5, _REACH * radius, _N_RINGS + 1)
     parts = [_ring_means(*one, edges) for one in zip(
         exposures, catalogues, stars, strict=True)]
-    flux = np.concatenate([np.asarray(one)[:, 2] for one in stars])
+    flux, number = np.concatenate(stars)[:, 2:].T
     means, counts = (np.concatenate(one) for one in zip(*parts, strict=True))
-    enough = np.count_nonzero(counts.sum(axis=1))
+    enough = np.unique(number[counts.any(axis=1)]).size
     if enough < _FEWEST_STARS:
         return None, (f'needs at least {_FEWEST_STARS} stars with free pixels '
                       f'up to {_REACH:.0f} radii around, got {enough}')

@@ -13,6 +13,7 @@ from photutils_mgauss.field.choice import DEGREES, full_degree, n_folds
 from photutils_mgauss.field.contexts import Contexts, context_terms
 from photutils_mgauss.field.forms import FreeShapes
 from photutils_mgauss.field.normal import FieldProblem
+from photutils_mgauss.field.places import places, same_stars
 from photutils_mgauss.field.stamps import Stamps, cut_stamps, remove_star_noise
 from photutils_mgauss.utils.correlated_noise import noise_correlation
 from photutils_mgauss.utils.image import read_pixels
@@ -62,6 +63,8 @@ class Sample:
         The contexts of each star, NaN where unknown.
     contexts : Contexts or None
         Their scales, if there are any.
+    star, place : (n,) `~numpy.ndarray` of int
+        Which star, and at which place of the detector, each is.
     """
 
     stamps: Stamps
@@ -77,6 +80,13 @@ class Sample:
     growth: np.ndarray
     values: np.ndarray
     contexts: Contexts | None
+    star: np.ndarray
+    place: np.ndarray
+
+    @property
+    def n_places(self):
+        """At how many places the stars show the PSF."""
+        return np.unique(self.place).size
 
     def expected(self):
         """Return x and y (n,) of the stars in their tables."""
@@ -101,7 +111,7 @@ class Sample:
             self.stamps, np.zeros(self.stamps.data.shape), basis, self.sources,
             self.sources.copy(), hold, self.count, np.zeros(n),
             bool(local_bkg), np.ones(n, bool), self.exposure, FreeShapes(),
-            np.zeros((n, 3)), extra=extra)
+            np.zeros((n, 3)), extra=extra, star=self.star, place=self.place)
 
     def without_deviant(self, used):
         """Return the sample in which the stars not used (n,) are deviant."""
@@ -149,6 +159,12 @@ def read_sample(data, stars, error, mask, radius, gain, contexts=()):
         raise ValueError(msg)
     _check_light(stamps)
     most = max(part[4].shape[1] for part in parts)
+    stars = [number[part[1]] for number, part in zip(
+        same_stars([part[2] for part in parts]), parts, strict=True)]
+    where = np.concatenate([np.column_stack([part[2].x, part[2].y])[part[1]]
+                            for part in parts]).T
+    # Numbers without gaps: stars in the order in which they come.
+    star = _numbered(np.concatenate(stars))
     return Sample(
         stamps, np.concatenate([
             np.pad(part[4], ((0, 0), (0, most - part[4].shape[1]), (0, 0)))
@@ -161,7 +177,15 @@ def read_sample(data, stars, error, mask, radius, gain, contexts=()):
         [_correlation(pixels, part[2], radius)
          for (pixels, _), part in zip(exposures, parts, strict=True)],
         np.ones(len(parts)), values,
-        Contexts.of_stars(contexts, values) if contexts else None)
+        Contexts.of_stars(contexts, values) if contexts else None,
+        star, places(star, *where, exposures[0][0].shape))
+
+
+def _numbered(values):
+    """Return the same numbers without gaps, by first appearance."""
+    _, first, inverse = np.unique(values, return_index=True,
+                                  return_inverse=True)
+    return np.argsort(np.argsort(first))[inverse]
 
 
 def _context_values(table, names):
@@ -321,8 +345,13 @@ def _with_neighbours(sources, index, stamps):
     return table, count
 
 
-def possible_degree(degree, n_stars):
-    """Return the highest degree to try; warn if a lower one must do."""
+def possible_degree(degree, sample):
+    """
+    Return the highest degree to try; warn if a lower one must do.
+
+    Of stars that several exposures show at one place, one counts.
+    """
+    n_stars = sample.n_places
     if degree == 'auto':
         # Some of the stars are left out while the degree is chosen.
         rest = n_stars - n_stars // n_folds(n_stars)
@@ -332,8 +361,10 @@ def possible_degree(degree, n_stars):
         return degree
     possible = max(d for d in range(min(degree, n_stars))
                    if n_stars >= _stars_needed(d))
+    what = ('stars' if n_stars == len(sample.row) else
+            f'places of {len(sample.row)} detections of stars')
     warnings.warn(
-        f'{n_stars} stars are too few for degree {degree}, which needs '
+        f'{n_stars} {what} are too few for degree {degree}, which needs '
         f'{needed}; degree {possible} is used', AstropyUserWarning,
         stacklevel=3)
     return possible

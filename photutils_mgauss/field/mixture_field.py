@@ -94,7 +94,9 @@ class MixtureField(Field):
         The stars, including those that were dropped: ``x``, ``y``,
         ``x_fit``, ``y_fit``, ``flux_fit``, ``local_bkg``,
         ``reduced_chi2``, ``n_pixels_fit``, ``n_pixels_rejected``, ``used``
-        and, where not used, the ``reason``.
+        and, where not used, the ``reason``; of several exposures
+        ``exposure``, and ``star``, which is the same for all detections of
+        a star.
     residual_stars : (n, s, s) `~numpy.ndarray`
         Data minus model of the stars in ``stars``; NaN outside the circle and
         at pixels that were not used.

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from photutils_mgauss import kernels
+from photutils_mgauss.field.places import in_turn
 from photutils_mgauss.psf.rows import kernel_rows_of_logs
 from photutils_mgauss.utils.parallel import SINGLE_BLAS, Threads
 
@@ -76,6 +77,13 @@ class FieldProblem:
         Whether the shapes are integrated over pixels, not sampled.
     extra : (n, X) `~numpy.ndarray`, optional
         Terms that do not depend on the degree, as those of colours.
+    star, place : (n,) `~numpy.ndarray` of int, optional
+        Which star each detection is of, and at which place; by default all
+        are different.
+    places_once : bool, optional
+        Whether all detections at one place count as much as one of them.
+        They share what is wrong there, as the light of faint neighbours, and
+        would say twenty times that the PSF is different there.
     """
 
     stamps: object
@@ -93,10 +101,21 @@ class FieldProblem:
     local: np.ndarray
     pixel_integrated: bool = False
     extra: np.ndarray = None
+    star: np.ndarray = None
+    place: np.ndarray = None
+    places_once: bool = True
 
     def __post_init__(self):
+        for name in ('star', 'place'):
+            if getattr(self, name) is None:
+                setattr(self, name, np.arange(len(self.basis)))
         if self.extra is None:
             self.extra = np.zeros((len(self.basis), 0))
+
+    @property
+    def n_places(self):
+        """At how many places of the detector stars are."""
+        return np.unique(self.place).size
 
     @property
     def n_extra(self):
@@ -113,7 +132,18 @@ class FieldProblem:
         return replace(self, stamps=self.stamps.subset(index), **{
             name: getattr(self, name)[index] for name in
             ('weights', 'basis', 'sources', 'anchors', 'hold', 'n_sources',
-             'sky', 'used', 'exposure', 'local', 'extra')})
+             'sky', 'used', 'exposure', 'local', 'extra', 'star', 'place')})
+
+    def shares(self):
+        """Return as how much of a star each detection counts, (n,)."""
+        if not self.places_once:
+            return np.ones(len(self.place))
+        numbers = np.bincount(self.place, self.used)
+        return 1 / np.maximum(numbers[self.place], 1)
+
+    def brightest(self):
+        """Return the order of detections: bright first, places in turn."""
+        return in_turn(self.place, self.sources[:, 0, 2])
 
     def shapes(self, coefficients):
         """Return the shapes of the PSF at each star, (n, K, 6)."""
@@ -188,17 +218,20 @@ class Workers:
 
 def equations(problem, coefficients, workers):
     """Form the normal equations at the coefficients."""
+    shares = problem.shares()
     parts = workers.map(
         _PartEquations(coefficients, problem.fit_sky, problem.form,
                        problem.pixel_integrated),
-        len(problem.basis), problem.stamps.data, problem.weights,
+        len(problem.basis), problem.stamps.data,
+        problem.weights * shares[:, None, None],
         problem.stamps.corners, problem.basis, problem.local,
         problem.sources, problem.anchors, problem.hold, problem.n_sources,
         problem.sky, problem.used)
     workers.tell()
-    own, *numbers = (np.concatenate(columns)
-                     for columns in zip(*parts, strict=True))
-    return Equations(*_spread(own, problem.basis), *numbers)
+    own, chi2, sources, sky = (np.concatenate(columns)
+                               for columns in zip(*parts, strict=True))
+    return Equations(*_spread(own, problem.basis), chi2 / shares, sources,
+                     sky)
 
 
 def _spread(own, basis):
@@ -406,6 +439,7 @@ def optimise(problem, coefficients, prior, workers, *, max_steps=30,
     present = equations(problem, coefficients, workers)
     cost = _cost(problem, present, prior, coefficients)
     growth = kernels.FIRST_GROWTH
+    n_stars = problem.shares()[problem.used].sum()
     for _ in range(max_steps):
         problem.sources, problem.sky = present.sources, present.sky
         matrix = present.matrix + np.diag(prior.curvature(coefficients))
@@ -417,7 +451,7 @@ def optimise(problem, coefficients, prior, workers, *, max_steps=30,
         gain = cost - _cost(problem, new, prior, trial)
         if gain > 0:
             coefficients, present, cost = trial, new, cost - gain
-            if max(gain, expected) < tolerance * problem.used.sum():
+            if max(gain, expected) < tolerance * n_stars:
                 break
         elif damping > 1e6:
             break
@@ -428,7 +462,8 @@ def optimise(problem, coefficients, prior, workers, *, max_steps=30,
 
 
 def _cost(problem, state, prior, coefficients):
-    cost = state.chi2[problem.used].sum() + prior.cost(coefficients)
+    cost = ((problem.shares() * state.chi2)[problem.used].sum()
+            + prior.cost(coefficients))
     # Where Gaussians are too thin for their equations to be told from
     # rounding, there is no next step.
     diagonal = np.diag(state.matrix) + to_vector(prior.precision)

@@ -229,7 +229,7 @@ def begin(problem, n_components, strength, workers, ladders=None):
     workers.tell('the mean PSF')
     if ladders is None:
         ladders = _LADDERS if problem.pixel_integrated else (PLAIN,)
-    brightest = np.argsort(-problem.sources[:, 0, 2])[:_START_STARS]
+    brightest = problem.brightest()[:_START_STARS]
     few = problem.subset(brightest)
     few.basis = np.ones((len(brightest), 1))
     width = first_width(few)
@@ -400,7 +400,7 @@ def run(problem, n_components, degree, workers, *, strength=1.0, reject=True,
     which is not finished (see `finish`) if its accuracy is ``poor`` or worse.
     """
     state = _first_state(problem, n_components, degree, strength, workers)
-    brightest = np.argsort(-problem.sources[:, 0, 2])
+    brightest = problem.brightest()
     for low in range(degree + 1):
         if course.degrees is not None and low not in course.degrees:
             continue
@@ -491,6 +491,7 @@ def added_shapes(state):
                     - state.blurs[problem.exposure])
     return replace(
         problem, form=TunedShapes(), basis=np.eye(n)[problem.exposure],
+        places_once=False,
         local=TunedShapes.local(known.shapes(state.coefficients), 1.0))
 
 
