@@ -4,7 +4,7 @@ import warnings
 from functools import cache, partial
 from pathlib import Path
 
-from photutils_mgauss.cli import together, tools
+from photutils_mgauss.cli import given_stars, together, tools
 from photutils_mgauss.cli.progress import Progress
 from photutils_mgauss.cli.psf_stars import check_image
 from photutils_mgauss.cli.results import (
@@ -43,7 +43,9 @@ def add(commands):
     parser.add_argument('--output', metavar='NAME',
                         help='folder, or for a single image a file: .ecsv or '
                              '.fits (default: IMAGE_cat.ecsv)')
-    together.add_option(add_measuring(parser))
+    group = add_measuring(parser)
+    given_stars.add_options(group)
+    together.add_option(group)
     tools.add_times(parser)
     tools.add_reading(parser)
     add_checkpoint(parser)
@@ -79,7 +81,8 @@ def run(options):
         options.parser.error(
             '--psf must be given, got none; without it, mgauss psf makes '
             'one of an image, and --crowded one of the stars of each image')
-    tools.check_inputs([*paths, *options.psf])
+    tools.check_inputs([*paths, *options.psf, options.stars])
+    given_stars.check(options)
     tools.check_different(paths)
     if options.together:
         together.run(options, cache(partial(
@@ -90,23 +93,26 @@ def run(options):
     owners = tools.one_each(options.psf, len(paths), 'psf')
     read = tools.read_images(options, paths)
     results = Results(options)
-    results.claim(names, [*paths, *options.psf])
+    given = [] if options.stars is None else [options.stars]
+    results.claim(names, [*paths, *options.psf, *given])
     with Progress(1 + len(names), options) as step:
         step('look at all files')
         psfs = {path: _read_psf(path, options.checkpoint)
                 for path in dict.fromkeys(options.psf)}
         for i in range(len(paths)):
             check_image(read(i))
+        stars = (given_stars.StarList(options.stars, options) if given
+                 else None)
         if results.only_planned():
             return
         for i, name in enumerate(names):
             step(f'measure {paths[i]}')
             image = read(i)
-            key = results.key(file_marks(paths[i], owners[i],
+            key = results.key(file_marks(paths[i], owners[i], options.stars,
                                          image.reading.wcs), image.content)
             results.obtain(name, key, partial(
                 make, options, image, psfs.get(owners[i]), name,
-                psf=owners[i] and str(owners[i])))
+                stars, psf=owners[i] and str(owners[i])))
             results.deliver()
             tools.say(options, f'{name} is written')
 
@@ -117,12 +123,16 @@ def _read_psf(path, checkpoint):
         return read_psf(path, checkpoint=checkpoint)
 
 
-def make(options, image, model, name, **more):
-    """Return the catalogue of an image, and what writes it."""
+def make(options, image, model, name, stars=None, **more):
+    """
+    Return the catalogue of an image, and what writes it.
+
+    With a `StarList` it is that of its stars.
+    """
     tools.say(options, image.describe())
     if image.saturation is not None:
         tools.say(options, f'{image.path}: {image.say_saturation()}')
-    table = measure(image, model, options)
+    table = measure(image, model, options, stars)
     tools.say(options, f'{image.path}: {len(table)} stars'
                        f'{_saturated(table)}')
     return table, partial(tools.write_table, table, record=tools.record_of(
@@ -136,11 +146,14 @@ def _saturated(table):
     return f', {n} of them saturated or masked, from their wings' if n else ''
 
 
-def measure(image, psf, options):
-    """Return the catalogue of an image."""
+def measure(image, psf, options, stars=None):
+    """Return the catalogue of an image, or of a `StarList` in it."""
     with tools.about(image.path):
-        table = (_crowded if options.crowded else _sparse)(image, psf,
-                                                           options)
+        given = None if stars is None else stars.in_image(image)
+        table = (_crowded if options.crowded else _sparse)(
+            image, psf, options, given)
+        if given is not None:
+            table['id'] = given['id']
         if table is None or len(table) == 0:
             msg = 'must show a star, got none; try --threshold'
             raise ValueError(msg)
@@ -166,7 +179,7 @@ def _check_fits(image, table):
             stacklevel=2)
 
 
-def _sparse(image, psf, options):
+def _sparse(image, psf, options, given):
     from photutils.detection import DAOStarFinder
 
     from photutils_mgauss.photometry.psf_photometry import MixturePSFPhotometry
@@ -175,16 +188,19 @@ def _sparse(image, psf, options):
     finder = DAOStarFinder(threshold * float(
         image.sky.background_rms_median), fwhm)
     noise = image.noise
+    if given is not None and options.fixed:
+        psf = psf.copy()
+        psf.x_0.fixed = psf.y_0.fixed = True
     photometry = MixturePSFPhotometry(
         psf, options.fit_shape, finder=finder,
         aperture_radius=max(2.0, 1.5 * fwhm), effective_gain=noise.gain,
         xy_cov=True, saturation=image.saturation_without_sky,
         residual_radius=options.residual_radius)
     return photometry(image.without_sky, error=noise.background,
-                      mask=image.mask)
+                      mask=image.mask, init_params=given)
 
 
-def _crowded(image, psf, options):
+def _crowded(image, psf, options, given):
     from photutils_mgauss.crowded.photometry import CrowdedMixturePhotometry
     if psf is None:
         psf = own_psf(image, options)
@@ -193,7 +209,8 @@ def _crowded(image, psf, options):
         effective_gain=image.noise.gain, checkpoint=options.checkpoint,
         saturation=image.saturation,
         residual_radius=options.residual_radius)
-    return photometry(image.data, error=image.noise.total, mask=image.mask)
+    return photometry(image.data, error=image.noise.total, mask=image.mask,
+                      init_params=given)
 
 
 def own_psf(image, options):

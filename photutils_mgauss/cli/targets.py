@@ -13,6 +13,7 @@ from photutils_mgauss.sky.tangent_plane import MAS, unit_vectors
 from photutils_mgauss.utils.star_columns import column_values
 
 _NEEDED = ('id', 'ra', 'dec', 'pmra', 'pmdec', 'parallax', 'ref_epoch')
+_MOTION = ('pmra', 'pmdec', 'ref_epoch')
 # An object is looked for within this distance of its place [mas].
 _RADIUS = 3000.0
 
@@ -46,18 +47,43 @@ def seen_directions(table, year, observer):
         Julian year (TDB).
     observer : str or `~astropy.coordinates.CartesianRepresentation` or None
     """
-    ra, dec, pmra, pmdec, parallax = (
-        column_values(table, name)
-        for name in ('ra', 'dec', 'pmra', 'pmdec', 'parallax'))
+    moved, _ = moved_directions(table, year)
+    place = observer_position(observer, np.array(year))
+    parallax = column_values(table, 'parallax', u.mas)
+    seen = moved - parallax / MAS * place[:, None]
+    return seen / np.linalg.norm(seen, axis=0)
+
+
+def moved_directions(table, year):
+    """
+    Return where objects are in a year, vectors (3, n) of about unit length.
+
+    Parameters
+    ----------
+    table : `~astropy.table.Table`
+        With ra and dec, and for motions pmra, pmdec and ref_epoch, in Gaia's
+        units. An object without a motion stays where it is.
+    year : float or None
+        Julian year (TDB); None for the places in the table.
+
+    Returns
+    -------
+    (3, n) `~numpy.ndarray`
+    moved : bool
+        Whether the table has motions and the year is known.
+    """
+    ra, dec = (column_values(table, name, u.deg) for name in ('ra', 'dec'))
     start = unit_vectors(ra, dec)
+    if year is None or not set(_MOTION) <= set(table.colnames):
+        return start, False
+    pmra, pmdec = (np.nan_to_num(column_values(table, name, u.mas / u.yr))
+                   for name in ('pmra', 'pmdec'))
     east = np.stack([-np.sin(np.radians(ra)), np.cos(np.radians(ra)),
                      np.zeros_like(ra)])
     north = np.cross(start, east, axis=0)
-    passed = year - julian_years(table['ref_epoch'], 'ref_epoch')
-    moved = start + (pmra * east + pmdec * north) * passed / MAS
-    place = observer_position(observer, np.array(year))
-    seen = moved - parallax / MAS * place[:, None]
-    return seen / np.linalg.norm(seen, axis=0)
+    passed = np.nan_to_num(year - julian_years(table['ref_epoch'],
+                                               'ref_epoch'))
+    return start + (pmra * east + pmdec * north) * passed / MAS, True
 
 
 def only_targets(stars, targets, year, observer, radius):
