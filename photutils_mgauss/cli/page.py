@@ -17,7 +17,8 @@ nav a { color: #00558a; overflow-wrap: anywhere; }
 .figures { display: grid; gap: 16px;
            grid-template-columns: repeat(auto-fit, minmax(min(100%, 340px),
                                                           1fr)); }
-figure { margin: 0; }
+figure { margin: 0; padding: 10px 12px; border-radius: 10px; color: #1b2733;
+         background: #fff; border: 1px solid #d5dde4; }
 figure img { width: 100%; max-width: 560px; height: auto; display: block; }
 figcaption { font-size: 0.9em; color: #44617b; }
 .wide { overflow-x: auto; margin: 12px 0; }
@@ -33,11 +34,10 @@ pre { overflow-x: auto; background: #f2f5f8; padding: 8px; }
 .look { border-color: #d55e00; }
 @media (prefers-color-scheme: dark) {
   body { color: #dce4ea; background: #15191d; }
-  figcaption { color: #a9bccb; }
+  figure { background: #e3e9ee; border-color: #e3e9ee; }
   nav a, summary { color: #7cc0ee; }
   pre { background: #22282e; }
   th, td { border-color: #38424b; }
-  figure img { background: #fff; border-radius: 4px; }
 }
 """
 
@@ -151,6 +151,10 @@ def _figure(title, panel):
     from matplotlib.figure import Figure
     figure = Figure(figsize=(5.2, 4.2), dpi=120, layout='constrained')
     panel.draw(figure.subplots())
+    # The card that the page puts figures on, light on dark pages too, is
+    # their background.
+    for patch in (figure.patch, *(one.patch for one in figure.axes)):
+        patch.set_alpha(0)
     # How wide the numbers beside colour bars are is known once they are drawn:
     # only then are they laid out, once.
     layout = figure.get_layout_engine()
