@@ -195,6 +195,16 @@ class Model:
                           self.wing, self.gaussians, _FAINTEST * self.noise,
                           kernels.WingScratch.empty(image.shape[1]), image)
 
+    def add_light(self, chosen, image):
+        """Add the light of chosen stars to an image, in place."""
+        self._add_stars(chosen, 1.0, image)
+
+    def take_off(self, image):
+        """Take light that is no star's off the data."""
+        self.data = self.data - image
+        self.residual -= image
+        self._weigh()
+
     def background(self):
         """Return the image of the background, diffuse light included."""
         return self.mesh.image(self.level) + self.diffuse.image()

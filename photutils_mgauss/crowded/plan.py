@@ -24,7 +24,12 @@ _FAR = 5.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """What comes back from a worker."""
+    """
+    What comes back from a worker.
+
+    ``saturated`` tells whether the tile has saturated stars, ``known`` whether
+    it was measured what the PSF leaves of them.
+    """
 
     stars: Stars
     chi2: float = 0.0
@@ -32,6 +37,8 @@ class Outcome:
     widths: np.ndarray = field(default_factory=lambda: np.empty(0))
     pairs: np.ndarray = field(default_factory=no_pairs)
     n_far: int = 0
+    saturated: bool = False
+    known: bool = False
 
     @classmethod
     def of(cls, job):
@@ -43,22 +50,24 @@ class Outcome:
         chi2 = model.weight * model.residual**2
         return cls(tabulate(tile, job.core), float(chi2.sum()),
                    int(model.good.sum()), tile.widths, noise_pairs(model),
-                   int((chi2 > _FAR**2).sum()))
+                   int((chi2 > _FAR**2).sum()),
+                   bool(tile.stars.seeded.any()), tile.wings_known)
 
     @classmethod
     def of_arrays(cls, arrays):
         """Return what `arrays` made arrays of."""
         widths, pairs = arrays.pop('tile_widths'), arrays.pop('tile_pairs')
-        chi2, n_pixels, n_far = arrays.pop('tile_sums')
+        chi2, n_pixels, n_far, *wings = arrays.pop('tile_sums')
         return cls(Stars.of_columns(arrays), float(chi2), int(n_pixels),
-                   widths, pairs, int(n_far))
+                   widths, pairs, int(n_far), *map(bool, wings))
 
     def arrays(self):
         """Return all there is as a dict of arrays."""
         return {**vars(self.stars), 'tile_widths': self.widths,
                 'tile_pairs': self.pairs,
-                'tile_sums': np.array([self.chi2, self.n_pixels, self.n_far],
-                                      float)}
+                'tile_sums': np.array([
+                    self.chi2, self.n_pixels, self.n_far, self.saturated,
+                    self.known], float)}
 
 
 class Tiles:

@@ -4,6 +4,7 @@ from photutils_mgauss.crowded.bright import (
     saturated_stars,
     size_differences,
 )
+from photutils_mgauss.crowded.bright_wings import left_of_bright
 from photutils_mgauss.crowded.given import associate, warm_up
 from photutils_mgauss.crowded.search import find, leave_out
 from photutils_mgauss.crowded.tile import Tile
@@ -33,7 +34,8 @@ def solve_tile(job):
     else:
         tile.start(saturated_stars(tile.model))
         tile.note_least(least_fluxes)
-        find_all(tile, find, leave_out)
+        find_all(tile, find, leave_out,
+                 lambda tile: tile.take_off_wings(left_of_bright))
         if job.given is not None:
             associate(tile, job.given, leave_out)
     settle(tile, leave_out)
@@ -43,7 +45,7 @@ def solve_tile(job):
 # What is done does not depend on how many stars there are or move: what
 # happens around a star has to be the same on every tile it is on.
 
-def find_all(tile, find, leave_out):
+def find_all(tile, find, leave_out, take_off=None):
     """Find and fit stars, the brightest first, with the searches given."""
     options = tile.options
     for number, threshold in enumerate(_FALLING):
@@ -56,6 +58,8 @@ def find_all(tile, find, leave_out):
                 tile.note_widths(size_differences)
             leave_out(tile, 1.0)
             tile.update_diffuse()
+    if take_off is not None:
+        take_off(tile)
     for number in range(options.max_rounds):
         find(tile, options.faintest, len(_FALLING) + number)
         tile.step(0.05)

@@ -15,6 +15,7 @@ from photutils_mgauss.crowded.table import (
     no_stars,
 )
 from photutils_mgauss.crowded.unfinished import UnfinishedTilesError
+from photutils_mgauss.psf.residual import FEWEST
 from photutils_mgauss.utils.correlated_noise import correlation_of, no_pairs
 
 # A PSF whose size is off by more than this fraction is warned of.
@@ -110,4 +111,20 @@ def _report(done, options, stacklevel):
             'that error is right, that the PSF is that of the image, and '
             'that its light is positive', AstropyUserWarning,
             stacklevel=stacklevel)
-    return {'reduced_chi2': chi2, 'psf_size_difference': width}
+    return {'reduced_chi2': chi2, 'psf_size_difference': width,
+            **_of_saturated(done)}
+
+
+def _of_saturated(done):
+    """Return what was done for saturated stars, nothing if there are none."""
+    known = [o.known for o in done if o.saturated]
+    if not known:
+        return {}
+    if all(known):
+        return {'saturated_wings': (
+            'what the PSF leaves of saturated stars was measured on bright '
+            'stars and subtracted')}
+    return {'saturated_wings': (
+        'what the PSF leaves of saturated stars was not measured in '
+        f'{known.count(False)} of {len(known)} tiles with saturated stars: '
+        f'{FEWEST} bright stars that are not saturated are needed')}

@@ -119,6 +119,8 @@ class Tile(Searched):
         How far each star went in the last step [pix].
     least : (ny, nx) `~numpy.ndarray`
         Which flux a new star has at least.
+    wings_known : bool
+        Whether what the PSF leaves of saturated stars was measured.
     """
 
     def __init__(self, job):
@@ -128,6 +130,7 @@ class Tile(Searched):
         self.origin = job.origin
         self.widths = np.empty(0)
         self.moved = np.empty(0)
+        self.wings_known = False
         self.least = np.zeros(job.data.shape)
         self.templates = _templates(job.psf, job.data.shape)
 
@@ -235,6 +238,18 @@ class Tile(Searched):
     def update_diffuse(self):
         """Find the diffuse light again."""
         self.model.update_diffuse()
+        self._form_equations()
+
+    def take_off_wings(self, measure):
+        """Take off what the PSF leaves of saturated stars, as measured."""
+        known, gone = measure(self)
+        self.wings_known = known is not None
+        if not self.wings_known:
+            return
+        self.model.dismiss(gone)
+        s = self.stars
+        self.model.take_off(known.image(*(
+            column[s.seeded] for column in (s.x, s.y, s.flux))))
         self._form_equations()
 
     def note_least(self, measure):
