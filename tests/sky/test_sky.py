@@ -4,7 +4,9 @@ import erfa
 import numpy as np
 import pytest
 from astropy.coordinates import (
+    FK5,
     CartesianRepresentation,
+    Galactic,
     SkyCoord,
     get_body_barycentric,
 )
@@ -24,7 +26,7 @@ from photutils_mgauss.sky.tangent_plane import (
     directions,
     unit_vectors,
 )
-from photutils_mgauss.sky.wcs import pixel_to_vectors
+from photutils_mgauss.sky.wcs import celestial_frame, pixel_to_vectors
 
 # The tangent plane
 
@@ -106,6 +108,24 @@ def test_an_observer_given_as_a_place_is_used(rng):
     place = CartesianRepresentation([1.0, 2.0, 3.0] * u.au)
     assert_allclose(observer_position(place, np.array([2020.0, 2021.0])),
                     [[1, 1], [2, 2], [3, 3]])
+
+
+# Frames
+
+def _galactic_wcs():
+    wcs = tan_wcs(30.0, 20.0)
+    wcs.wcs.ctype = 'GLON-TAN', 'GLAT-TAN'
+    return wcs
+
+
+@pytest.mark.parametrize('wcs', [
+    tan_wcs(30.0, 20.0), _galactic_wcs(), make_gwcs(30.0, 20.0),
+    make_gwcs(30.0, 20.0, frame=FK5(equinox='J1975')),
+    make_gwcs(30.0, 20.0, frame=Galactic())])
+def test_the_frame_is_that_of_the_places_of_pixels(wcs):
+    frame = celestial_frame(wcs)
+    assert frame.is_equivalent_frame(wcs.pixel_to_world(5.0, 7.0).frame)
+    assert not frame.has_data
 
 
 # The inverse
