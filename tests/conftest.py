@@ -18,11 +18,21 @@ REALDATA = Path(os.environ.get(
     Path(__file__).resolve().parents[2] / 'shared' / 'realdata'))
 
 
+_COMPILING = []
+
+
 def pytest_sessionstart(session):
     """Compile before processes share the tests: each would, all the same."""
     if getattr(session.config.option, 'numprocesses', None):
-        subprocess.run([sys.executable, '-m', 'photutils_mgauss', 'compile',
-                        '--quiet'], check=True)
+        _COMPILING.append(subprocess.Popen([
+            sys.executable, '-m', 'photutils_mgauss', 'compile', '--quiet']))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished():
+    """Wait until all is compiled: meanwhile the processes look for tests."""
+    while _COMPILING:
+        assert _COMPILING.pop().wait() == 0, 'mgauss compile failed'
 
 
 @pytest.fixture

@@ -349,6 +349,7 @@ def test_processes_share_the_cores(monkeypatch):
     assert parallel.available_cores() == cores
 
 
+@pytest.mark.long
 def test_detectors_and_pixels_are_steps_of_a_survey(images, tmp_path, capsys):
     pytest.importorskip('pyarrow')
     path = tmp_path / 'survey.toml'
@@ -385,6 +386,7 @@ def test_detectors_and_pixels_are_steps_of_a_survey(images, tmp_path, capsys):
     assert stamps(folder) == before
 
 
+@pytest.mark.long
 def test_results_are_the_same_whoever_makes_them(images, tmp_path, capsys):
     pytest.importorskip('pyarrow')
     from pyarrow import dataset

@@ -44,7 +44,9 @@ def draw(n_stars, size, seed, flux=3e4):
     mixture = GaussianMixture([1], [[0, 0]], [[[1.44, 0], [0, 1.44]]])
     data = np.full((size, size), 100.0)
     for x, y in rng.uniform(10, size - 10, (n_stars, 2)):
-        data += mixture.render((size, size), x, y, flux=flux)
+        left, low = int(x) - 8, int(y) - 8
+        data[low:low + 18, left:left + 18] += mixture.render(
+            (18, 18), x - left, y - low, flux=flux)
     return mixture, rng.poisson(data)
 
 
@@ -374,6 +376,7 @@ def wait_for(path, words, run):
     pytest.fail(f'{words} is not in {path}')
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(('signal_sent', 'code', 'said'), [
     (signal.SIGINT, 130, 'interrupted'),
     (signal.SIGTERM, 143, 'terminated')])
@@ -388,7 +391,7 @@ def test_an_interrupt_is_obeyed_at_once(long_work, tmp_path, words,
     run = start(*words.split(), '--log-file', log, folder=long_work)
     what = 'measure' if 'psf 1' not in words else 'PSF of'
     wait_for(log, f'INFO {what} 1.fits', run)
-    time.sleep(1.5)
+    time.sleep(0.7)
     begun = time.monotonic()
     run.send_signal(signal_sent)
     _, err = run.communicate(timeout=30)
@@ -450,6 +453,7 @@ def test_a_killed_run_goes_on_where_it_stopped(here, monkeypatch):
     assert main(words) == 1
 
 
+@pytest.mark.long
 def test_motions_of_images_go_on_where_they_stopped(here, monkeypatch):
     from photutils_mgauss.cli import motions
     fit = '--n-components 1 --degree 0 --min-snr 5 --transform shift --quiet'
@@ -472,6 +476,7 @@ def test_motions_of_images_go_on_where_they_stopped(here, monkeypatch):
     assert main(words) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('seed', range(3))
 def test_work_that_is_killed_loses_no_result(here, seed):
     words = ['photometry', '1.fits', '2.fits', '--psf', 'psf.fits', '--quiet',

@@ -228,6 +228,7 @@ def test_a_complete_list_hides_nothing():
     assert (table['flux_confusion'] == 0).all()
 
 
+@pytest.mark.long
 def test_fluxes_in_many_images_know_of_hidden_stars_too():
     _, error, stars = scene(200, 1 / 16, 4)
     light = MixtureRenderer(PSF).image(stars, 1e-3, error.shape) + SKY

@@ -89,6 +89,7 @@ def test_pulls_scatter_by_one(crowd, kernel):
         assert pulls[False] > 1.1 * pulls[True]
 
 
+@pytest.mark.long
 def test_correlated_noise_is_not_taken_for_stars(crowd):
     clean, stars = crowd
     data, error = expose(clean, 3, BILINEAR)
@@ -129,6 +130,7 @@ def test_without_errors_nothing_is_looked_for(crowd):
     assert table.meta['noise_correlation'] == ''
 
 
+@pytest.mark.long
 def test_of_many_images_each_has_its_own(crowd):
     clean, _ = crowd
     wcs = WCS(naxis=2)

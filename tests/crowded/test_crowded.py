@@ -309,6 +309,7 @@ def test_tiles_do_not_change_a_star():
     assert np.percentile(np.abs(change), 99) < 1e-3
 
 
+@pytest.mark.long
 def test_processes_give_what_threads_give(crowd, fitted):
     with ProcessPoolExecutor(1, get_context('spawn')) as pool:
         table = photometry(tile_shape=70, executor=pool)(crowd[0],

@@ -343,6 +343,7 @@ def test_one_image_gives_what_it_gives_alone(field):
                     atol=0.01)
 
 
+@pytest.mark.long
 def test_tiles_and_processes_do_not_change_a_star(field, fitted, tmp_path):
     images = [(data, psf, wcs) for data, psf, wcs in field[0]]
     with ProcessPoolExecutor(1, get_context('spawn')) as pool:

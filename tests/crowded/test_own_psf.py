@@ -29,6 +29,7 @@ from photutils_mgauss.crowded import psf_loop
 from photutils_mgauss.field.growth import Wings
 from photutils_mgauss.utils.image import read_pixels
 
+pytestmark = pytest.mark.long
 SHAPE = (160, 160)
 QUICK = {'n_components': 3, 'degree': 1, 'radius': 10, 'max_stars': 100}
 

@@ -93,6 +93,7 @@ def test_stars_of_one_width_change_nothing(seed):
     assert auto == off
 
 
+@pytest.mark.long
 def test_it_can_be_asked_for_and_refused(given):
     assert fit(given, brighter_fatter=False).brighter_fatter is None
     narrow = fit(image(0 * ADDED, 4), brighter_fatter=True)
@@ -127,6 +128,7 @@ def test_files_keep_it(field, tmp_path, name):
                                                                 flux=1e5)
 
 
+@pytest.mark.long
 def test_exposures_share_it():
     given = [image(ADDED, seed) for seed in (6, 7)]
     with pytest.warns(AstropyUserWarning, match='bright stars are wider'):

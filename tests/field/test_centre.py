@@ -170,6 +170,7 @@ def test_another_word_for_the_centre_is_refused():
         fit_mixture_field(data, stars, error=error, centre='peak')
 
 
+@pytest.mark.long
 def test_two_halves_of_a_real_image_have_one_centre(realdata):
     path = realdata('spitzer_glimpse') / 'spitzer_example_image.fits'
     data = fits.getdata(path).astype(float)

@@ -1,5 +1,6 @@
 """More Gaussians where the usual number misses too much of the light."""
 import numpy as np
+import pytest
 from astropy.table import Table
 
 from photutils_mgauss import GaussianMixture, fit_mixture_field
@@ -36,6 +37,7 @@ def fitted(psf, **options):
                              **options)
 
 
+@pytest.mark.long
 def test_a_psf_that_six_gaussians_miss_gets_eight(caplog):
     caplog.set_level('INFO', 'photutils_mgauss')
     six, field = (fitted(curl(24), **options)

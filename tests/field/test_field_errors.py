@@ -62,6 +62,7 @@ def stated_errors(field):
     return np.sqrt(np.einsum('ip,ij,jp->p', slopes, field.covariance, slopes))
 
 
+@pytest.mark.long
 def test_errors_of_the_psf_are_as_large_as_its_covariance_says():
     truth = []
     for place in PLACES:

@@ -123,6 +123,7 @@ def resampled(seed):
             Table({'x': x + 0.5, 'y': y + 0.5, 'flux': np.full(x.size, 3e4)}))
 
 
+@pytest.mark.long
 def test_fluxes_know_what_smooth_noise_does_to_the_wings_of_a_psf():
     squares = []
     for seed in range(24):

@@ -125,6 +125,7 @@ def test_its_grid_has_the_nodes_of_the_archive_unless_told(archive, tuned):
     assert tuned.to_grid((2, 3)).grid_shape == (2, 3)
 
 
+@pytest.mark.long
 def test_errors_of_the_changes_are_their_scatter(archive):
     added = np.array([[0.3, 0.05], [0.05, 0.2]])
     pulls = []

@@ -119,6 +119,7 @@ def test_a_compressed_file_is_written_and_read(tmp_path):
     np.testing.assert_array_equal(again.grid.means, psf.grid.means)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('name', ['a.asdf', 'a.fits'])
 def test_two_hundred_reads_keep_no_memory(tmp_path, name):
     make_grid().write(tmp_path / name)

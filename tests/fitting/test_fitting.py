@@ -95,6 +95,7 @@ def test_pixels_that_are_masked_or_have_no_weight_do_not_matter():
     assert_same_psf(fit_mixture(damaged, 3, mask=mask).mixture, TRUTH)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('n_rows', [0, 2])
 def test_the_normal_equations_are_those_of_finite_differences(rng, n_rows):
     k, shape, centre = 3, (21, 24), np.array([10.0, 9.0])

@@ -191,6 +191,7 @@ def flux_scatter(psf, library, node):
     return np.std(table['flux_fit']) / 1e5 / scale
 
 
+@pytest.mark.long
 def test_the_fluxes_of_an_undersampled_camera_do_not_change_with_the_phase(
         undersampled):
     psf = GriddedMixturePSF.from_gridded_psf(undersampled)

@@ -54,6 +54,7 @@ def edit(path, old, new):
     path.write_text(text.replace(old, new), encoding='utf-8')
 
 
+@pytest.mark.long
 def test_an_edit_of_a_function_called_from_another_file_is_noticed(
         copy, tmp_path):
     cache = {'NUMBA_CACHE_DIR': str(tmp_path / 'cache')}
@@ -80,6 +81,7 @@ def test_without_a_folder_for_it_code_is_compiled_and_one_warning_given(
     assert 'NUMBA_CACHE_DIR' in result.stderr
 
 
+@pytest.mark.long
 def test_damaged_files_are_compiled_anew(copy, tmp_path):
     cache = {'NUMBA_CACHE_DIR': str(tmp_path / 'cache')}
     run(copy, **cache)
@@ -90,6 +92,7 @@ def test_damaged_files_are_compiled_anew(copy, tmp_path):
     assert result.stderr.count('UserWarning') <= 1
 
 
+@pytest.mark.long
 def test_who_waits_at_a_terminal_is_told_once(copy, tmp_path):
     slow = copy / 'kernels' / 'jit.py'
     edit(slow, '_PATIENCE = 1.0', '_PATIENCE = 0.01')
@@ -111,6 +114,7 @@ def _read(leader):
         return ''
 
 
+@pytest.mark.long
 def test_nothing_is_told_where_output_is_no_terminal(copy, tmp_path):
     edit(copy / 'kernels' / 'jit.py', '_PATIENCE = 1.0', '_PATIENCE = 0.01')
     result = run(copy, NUMBA_CACHE_DIR=str(tmp_path / 'cache'))
@@ -163,6 +167,7 @@ def test_what_is_compiled_for_python_is_handed_on():
     assert own <= set(kernels.__all__)
 
 
+@pytest.mark.long
 def test_the_command_compiles_every_kernel():
     code = """
 from photutils_mgauss.cli.compile_command import compile_all

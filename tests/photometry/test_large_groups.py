@@ -119,6 +119,7 @@ def test_the_order_of_stars_does_not_matter_nor_does_a_fitted_sky(rng):
     assert_allclose(table['sky'][0], 5, atol=5 * table['sky_err'][0])
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings('ignore:One or more fit')
 def test_three_hundred_stars_take_seconds():
     data, error, start = crowd(300, 80)

@@ -96,6 +96,7 @@ def errors(table):
                             (*NAMES, 'parallax')])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('parallax', [False, True])
 def test_one_star_is_fitted_as_scipy_fits_all_its_pixels(parallax, rng):
     star = truth(27.3, 31.8, (40, -25), 20.0 if parallax else 0.0)
@@ -116,6 +117,7 @@ def test_one_star_is_fitted_as_scipy_fits_all_its_pixels(parallax, rng):
     assert_allclose(solution.fluxes['local_bkg'], light[:, 1], rtol=1e-4)
 
 
+@pytest.mark.long
 def test_neighbours_are_fitted_together_as_scipy_does(rng):
     stars = truth([27.3, 29.9], [31.8, 30.9], ([30, -20], [0, 25]))
     images = observe(stars, [3000.0, 1500.0], YEARS, rng)

@@ -79,6 +79,7 @@ def test_images_become_motions_and_light_curves(folder):
         stars['flags'] == 0].min()
 
 
+@pytest.mark.long
 def test_the_page_shows_a_faint_star_and_the_gain(folder):
     pytest.importorskip('matplotlib')
     frames, out = folder / 'frames', folder / 'gain'
@@ -128,6 +129,7 @@ def frames_of(folder):
     return solution, out
 
 
+@pytest.mark.long
 def test_errors_of_frames_are_in_those_of_stars(folder, capsys):
     solution, frames = frames_of(folder)
     command = ['motions', '--pixels', *(str(folder / f'{name}.fits')

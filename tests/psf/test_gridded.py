@@ -260,6 +260,7 @@ def test_matching_undoes_a_shuffle_of_the_gaussians(rng):
         assert_allclose(sorted(expected.weights), [0.1, 0.3, 0.6])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('interpolation', ['blend', 'components'])
 def test_stamps_and_points_of_many_stars_follow_the_interpolation(
         rng, interpolation):

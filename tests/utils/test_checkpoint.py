@@ -132,6 +132,7 @@ def assert_same(one, other):
     assert one.meta == other.meta
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('given', [False, True])
 def test_tiles_go_on_where_they_were_stopped(scene, given, tmp_path,
                                              monkeypatch):

@@ -161,6 +161,7 @@ def resampled(kernel):
         np.full((len(weights), 2, 2), 0.0) + 1e-6 * np.eye(2))))
 
 
+@pytest.mark.long
 def test_fields_take_the_correlation_into_account():
     table = stars(flux=1e5)
     found, stated = [], []
