@@ -22,7 +22,7 @@ from photutils_mgauss.psf.wings import WINGS
 _TELLING = 0.1
 # What is fainter than this part of a typical telling star may be a piece of
 # what the PSF leaves of it.
-_DOUBTFUL = 0.01
+DOUBTFUL = 0.01
 # Their light elsewhere is measured on so many of the pixels, or on all.
 _ENOUGH = 0.05
 
@@ -52,8 +52,8 @@ def left_of_bright(tile):
     stars = np.stack([s.x, s.y, s.flux])
     reach = int(s.core[s.seeded].max()) + WINGS
     left = _with_faint(
-        tile.model, own & (s.flux < _DOUBTFUL * np.median(s.flux[telling])),
-        _beside(stars[:, telling | s.seeded], tile.least.shape, reach))
+        tile.model, own & (s.flux < DOUBTFUL * np.median(s.flux[telling])),
+        pixels_beside(stars[:, telling | s.seeded], tile.least.shape, reach))
     weight = tile.model.weight
     # Stars that are not found yet are noise, too.
     variance = np.maximum(np.divide(1, weight, where=weight > 0, out=np.full(
@@ -88,14 +88,17 @@ def _with_faint(model, faint, beside):
     """
     left = model.residual.copy()
     model.add_light(np.flatnonzero(faint), left)
-    good = model.weight > 0
+    return left - (left - model.residual)[
+        pixels_elsewhere(model.weight > 0, beside)].mean()
+
+
+def pixels_elsewhere(good, beside):
+    """Tell which good pixels (ny, nx) are not beside bright stars."""
     elsewhere = good & ~beside
-    if elsewhere.sum() < _ENOUGH * good.sum():
-        elsewhere = good
-    return left - (left - model.residual)[elsewhere].mean()
+    return elsewhere if elsewhere.sum() > _ENOUGH * good.sum() else good
 
 
-def _beside(stars, shape, reach):
+def pixels_beside(stars, shape, reach):
     """Tell which pixels (ny, nx) are near stars (3, n)."""
     far = np.ones(shape, bool)
     column, row = np.rint(stars[:2]).astype(int)

@@ -2,17 +2,22 @@
 from dataclasses import replace
 
 import numpy as np
+from astropy.stats import mad_std
 from scipy.spatial import cKDTree
 
+from photutils_mgauss.crowded.bright_wings import (
+    DOUBTFUL,
+    pixels_beside,
+    pixels_elsewhere,
+)
 from photutils_mgauss.crowded.table import BLEND_CORRELATION, positions
 from photutils_mgauss.photometry.bright_residual import (
     BRIGHT,
-    doubtful,
     warn_of_few,
     without_surroundings,
 )
 from photutils_mgauss.psf.renderer import MixtureRenderer
-from photutils_mgauss.psf.residual import PSFResidual
+from photutils_mgauss.psf.residual import MOST, PSFResidual
 from photutils_mgauss.utils.flags import NOT_A_STAR, REPEATED, SATURATED
 from photutils_mgauss.utils.star_columns import column_values
 
@@ -44,8 +49,17 @@ def without_residual(image, model, table, radius):
     data, variance = image.part()
     known = None
     if telling.any():
-        drawn = ~doubtful(stars, np.flatnonzero(telling), radius)
-        left = _left_over(data, variance, model, table, drawn)
+        typical = np.median(np.sort(stars[2, telling])[-MOST:])
+        faint = (stars[2] < DOUBTFUL * typical) & (
+            (table['flags'] & REPEATED) == 0)
+        left = _left_over(data, variance, model, table, ~faint)
+        beside = pixels_beside(stars[:, telling | saturated], data.shape,
+                               radius)
+        left -= _mean_light(stars[:, faint], pixels_elsewhere(
+            variance > 0, beside))
+        # Stars that were not found are noise, too.
+        variance = np.where(variance > 0, np.maximum(
+            variance, mad_std(left[variance > 0])**2), 0)
         known = PSFResidual.of(
             left, without_surroundings(variance, stars[:, saturated], radius),
             stars[:, telling], radius)
@@ -56,6 +70,15 @@ def without_residual(image, model, table, radius):
     # most of that.
     data = image.data - known.image(*stars[:, bright])
     return replace(image, data=data), known
+
+
+def _mean_light(stars, where):
+    """Return the mean light of stars (3, n) in pixels (ny, nx)."""
+    ny, nx = where.shape
+    column, row = np.rint(stars[:2]).astype(int)
+    inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
+    inside[inside] = where[row[inside], column[inside]]
+    return stars[2, inside].sum() / max(np.count_nonzero(where), 1)
 
 
 def _kinds(table):

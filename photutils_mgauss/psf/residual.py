@@ -42,7 +42,7 @@ def _remaining_variance():
 _SMOOTHED = _remaining_variance()
 # Fewer stars tell nothing, fewer than the second nothing of slopes; more than
 # the last are not needed.
-FEWEST, _FEW, _MOST = 5, 30, 300
+FEWEST, _FEW, MOST = 5, 30, 300
 # What is not so many standard errors above noise is noise.
 _SIGNIFICANT = 4.0
 # Pixels further off than so many standard errors hold something else.
@@ -97,7 +97,7 @@ class PSFResidual:
         PSFResidual or None
             None if there are too few stars.
         """
-        stars = stars[:, np.argsort(-stars[2], kind='stable')[:_MOST]]
+        stars = stars[:, np.argsort(-stars[2], kind='stable')[:MOST]]
         n = stars.shape[1]
         if n < FEWEST:
             return None
