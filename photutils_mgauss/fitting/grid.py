@@ -51,7 +51,8 @@ def fit_node_images(nodes, n_components, *, scaled=True, **kwargs):
         raise ValueError(msg)
     grid, order = make_grid(mixtures, nodes.positions,
                             scales if scaled else None)
-    _warn_of_phases(report, n_components)
+    _warn_of_phases(report, n_components,
+                    kwargs.get('weighting', 'uniform'))
     report = report[order]
     report['id'] = np.arange(1, len(report) + 1)
     report['bridged'] = [mixtures[i] is None for i in order]
@@ -60,7 +61,7 @@ def fit_node_images(nodes, n_components, *, scaled=True, **kwargs):
     return grid, report
 
 
-def _warn_of_phases(report, n_components):
+def _warn_of_phases(report, n_components, weighting):
     """Warn of stars that change with their place in the pixel."""
     errors, shifts = report['flux_phase_error'], report['phase_error']
     n, n_shifts = (np.count_nonzero(values > limit) for values, limit in (
@@ -71,8 +72,8 @@ def _warn_of_phases(report, n_components):
             'change with the place of a star in its pixel by up to '
             f'{100 * np.nanmax(errors):.1f} % rms, by more than '
             f'{100 * FLUX_LIMIT:.1f} % at {n} of {len(report)} nodes (column '
-            "flux_phase_error of the report); more Gaussians or "
-            "weighting='photometric' make this smaller", AstropyUserWarning,
+            'flux_phase_error of the report); '
+            f'{_remedy(weighting, "photometric")}', AstropyUserWarning,
             stacklevel=5)
     if n_shifts:
         warnings.warn(
@@ -80,5 +81,16 @@ def _warn_of_phases(report, n_components):
             f'a star in its pixel by up to {np.nanmax(shifts):.4f} pix, by '
             f'more than {SHIFT_LIMIT} pix at {n_shifts} of {len(report)} '
             'nodes (column phase_error of the report), which the errors of '
-            "stars do not include; more Gaussians or weighting='astrometric' "
-            'make this smaller', AstropyUserWarning, stacklevel=5)
+            f'stars do not include; {_remedy(weighting, "astrometric")}',
+            AstropyUserWarning, stacklevel=5)
+
+
+def _remedy(weighting, best):
+    """Return what makes an error smaller that a weighting is best for."""
+    if weighting == best:
+        return 'more Gaussians make this smaller'
+    # Each of the two weightings makes the other's errors larger.
+    cost = {'photometric': ' (which is worse for fluxes)',
+            'astrometric': ' (which is worse for positions)'}
+    return (f'more Gaussians or weighting={best!r}{cost.get(weighting, "")} '
+            'make this smaller')

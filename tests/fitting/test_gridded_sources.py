@@ -1,5 +1,6 @@
 """Grids of mixtures from everything that photutils and PSFEx hand over."""
 import sys
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -332,3 +333,21 @@ def test_a_real_psfex_model_is_followed_between_the_nodes(name, realdata,
         worst = np.abs(found - image)[4:-4, 4:-4].max()
         # Blending adds little to what the mixture itself leaves.
         assert worst < own + 0.01 * image.max()
+
+
+@pytest.mark.parametrize(('weighting', 'positions', 'fluxes'), [
+    ('uniform', "or weighting='astrometric' make",
+     "or weighting='photometric' make"),
+    ('photometric', "weighting='astrometric' (which is worse for fluxes) make",
+     'more Gaussians make this'),
+    ('astrometric', 'more Gaussians make this',
+     "weighting='photometric' (which is worse for positions) make")])
+def test_no_remedy_is_one_that_is_taken_already(weighting, positions, fluxes):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('always')
+        GriddedMixturePSF.from_gridded_psf(airy_grid(1.0, 0.0), 2,
+                                           weighting=weighting)
+    said = {str(one.message).partition(' ')[0]: str(one.message)
+            for one in caught}
+    assert positions in said['positions']
+    assert fluxes in said['fluxes']
