@@ -21,8 +21,11 @@ _ALONG = np.ones((3, 1), bool), np.ones((1, 3), bool)
 # full, too.
 _PLATEAU = 0.9
 # Charge runs along an axis if clumps of at least so many rows and columns are
-# so many times longer that way: PSFs may be longer, too, but less.
+# so many times longer that way than light is.
 _LEAST_SIZE, _LONGER = 3, 1.5
+# What light is like is seen where unsaturated stars have more than this
+# fraction of the level.
+_BRIGHT = 0.1
 
 
 def as_saturation(value):
@@ -46,9 +49,12 @@ def saturated_pixels(pixels, level):
 
     Those at the level or above, those next to them that nearly are, and those
     that their charge has run into along rows or columns, with a pixel beyond
-    both ends of these. Where clumps are too small to say whether and along
-    which of both charge runs, a pixel all around is of no use, too. Other
-    pixels beside saturated ones tell most of where a star is, and are left.
+    both ends of these. Charge runs where clumps are much longer along an axis
+    than the light of unsaturated stars of a tenth of the level or more;
+    without such stars, light counts as round. Where clumps are too small to
+    say whether and along which of both charge runs, a pixel all around is of
+    no use, too. Other pixels beside saturated ones tell most of where a star
+    is, and are left.
 
     Parameters
     ----------
@@ -77,7 +83,8 @@ def saturated_pixels(pixels, level):
     for box in find_objects(clumps):
         _mark_trail(data, trails[0], box, level)
         _mark_trail(data.T, trails[1].T, box[::-1], level)
-    runs = _axes_of_charge(full, trails[0] | trails[1])
+    light = _aspect_of_light(pixels, level, trails[0] | trails[1])
+    runs = _axes_of_charge(light, full, trails[0] | trails[1])
     if runs is None:
         return binary_dilation(trails[0] | trails[1], _SQUARE)
     for axis in np.flatnonzero(runs):
@@ -86,12 +93,40 @@ def saturated_pixels(pixels, level):
     return full
 
 
-def _axes_of_charge(*masks):
+def _axes_of_charge(light, *masks):
     """Return along which axes charge runs, (2,), or None if unknown."""
-    sizes = np.array([[s.stop - s.start for s in box] for mask in masks
-                      for box in find_objects(label(mask, _SQUARE)[0])])
+    sizes = np.concatenate([_sizes(label(mask, _SQUARE)[0])
+                            for mask in masks])
     sizes = sizes[(sizes >= _LEAST_SIZE).all(axis=1)].sum(axis=0)
-    return sizes > _LONGER * sizes[::-1] if sizes.any() else None
+    if not sizes.any():
+        return None
+    longer = sizes[0] / (sizes[1] * light)
+    return np.array([longer, 1 / longer]) > _LONGER
+
+
+def _aspect_of_light(pixels, level, taken):
+    """Return how many times longer along columns unsaturated stars are."""
+    data = np.asarray(pixels.data)
+    if pixels.mask is not None:
+        data = np.where(pixels.mask, np.nan, data)
+    sky = np.nanmedian(data)
+    with np.errstate(invalid='ignore'):
+        clumps, _ = label(data > sky + _BRIGHT * (level - sky), _SQUARE)
+    clumps[np.isin(clumps, clumps[taken])] = 0
+    sizes = _sizes(clumps)
+    # Lines of single pixels are cosmic rays and bad columns.
+    sizes = sizes[(sizes >= _LEAST_SIZE).any(axis=1)
+                  & (sizes > 1).all(axis=1)]
+    # One round star more, because few stars say little.
+    steps = np.log(sizes[:, 0] / sizes[:, 1])
+    return np.exp(steps.sum() / (len(steps) + 1))
+
+
+def _sizes(clumps):
+    """Return how many rows and columns labelled clumps have, (n, 2)."""
+    return np.array([[side.stop - side.start for side in box]
+                     for box in find_objects(clumps) if box],
+                    int).reshape(-1, 2)
 
 
 def without_saturated(pixels, level):

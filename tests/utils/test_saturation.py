@@ -2,6 +2,7 @@
 import astropy.units as u
 import numpy as np
 import pytest
+from scipy.ndimage import find_objects, label
 
 from photutils_mgauss import GaussianMixture, MultiGaussianPSFModel
 from photutils_mgauss.psf.local import LocalPSF
@@ -49,14 +50,14 @@ def run_along_columns(light, full):
     """Return an image whose charge above a level runs up and down."""
     seen = np.minimum(light, full)
     for column, true in zip(seen.T, light.T, strict=True):
-        places = np.flatnonzero(true > full)
-        for end in (range(places[0] - 1, -1, -1),
-                    range(places[-1] + 1, len(true))) if places.size else ():
-            charge = (true[places] - full).sum() / 2
-            for row in end:
-                taken = min(charge, full - column[row])
-                column[row] += taken
-                charge -= taken
+        for part, in find_objects(label(true > full)[0]):
+            for end in (range(part.start - 1, -1, -1),
+                        range(part.stop, len(true))):
+                charge = (true[part] - full).sum() / 2
+                for row in end:
+                    taken = min(charge, full - column[row])
+                    column[row] += taken
+                    charge -= taken
     return seen
 
 
@@ -70,6 +71,47 @@ def test_only_pixels_that_hold_other_light_are_masked(runs):
     good = mask & (seen == light) & (light < 0.9 * 3e4)
     # One beyond each end of the columns, if any.
     assert good.sum() <= runs * 2 * mask.any(axis=0).sum()
+
+
+def sky_of_stars(shape, turned, tail):
+    """Return light (200, 200) of stars with a PSF so many times longer."""
+    rng = np.random.default_rng(11)
+    y, x = np.indices((200, 200))
+    along, across = (np.array([np.cos(turned), np.sin(turned)]),
+                     np.array([-np.sin(turned), np.cos(turned)]))
+    light = np.full((200, 200), 100.0)
+    places = np.stack(np.meshgrid(*[np.arange(25, 190, 30)] * 2), axis=-1)
+    for number, place in enumerate(places.reshape(-1, 2)):
+        dx, dy = x - place[0], y - place[1]
+        dx, dy = dx - rng.uniform(-3, 3), dy - rng.uniform(-3, 3)
+        r2 = ((along[0] * dx + along[1] * dy) ** 2 / shape
+              + (across[0] * dx + across[1] * dy) ** 2 * shape)
+        peak = 3e4 * (rng.uniform(2, 12) if number % 3 == 0
+                      else rng.uniform(0.1, 0.85))
+        light += peak * (np.exp(-r2 / 4) if tail == 'Gaussian'
+                         else (1 + r2 / 6) ** -2.5)
+    return light
+
+
+@pytest.mark.parametrize('runs', ['none', 'columns', 'rows'])
+@pytest.mark.parametrize(('shape', 'turned'), [
+    (1, 0), (1.5, 0), (2, 0), (1.5, np.pi / 2), (2, np.pi / 2),
+    (1.5, np.pi / 4), (1.3, np.radians(20))])
+@pytest.mark.parametrize('tail', ['Gaussian', 'Moffat'])
+def test_long_light_is_no_charge(shape, turned, tail, runs):
+    light, full = sky_of_stars(shape, turned, tail), 3e4
+    seen = np.minimum(light, full)
+    if runs == 'columns':
+        seen = run_along_columns(light, full)
+    elif runs == 'rows':
+        seen = run_along_columns(light.T, full).T
+    mask = mask_of(seen, full)
+    assert mask[seen != light].all()
+    good = mask & (seen == light) & (light < 0.9 * full)
+    # One beyond each end of a trail, if any.
+    ends = {'none': 0, 'columns': np.count_nonzero(np.diff(mask, axis=0)),
+            'rows': np.count_nonzero(np.diff(mask, axis=1))}[runs]
+    assert good.sum() <= ends
 
 
 def test_a_plateau_with_noise_is_masked_without_holes():
