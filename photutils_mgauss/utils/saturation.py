@@ -107,11 +107,15 @@ def _axes_of_charge(light, *masks):
 def _aspect_of_light(pixels, level, taken):
     """Return how many times longer along columns unsaturated stars are."""
     data = np.asarray(pixels.data)
+    good = np.isfinite(data)
     if pixels.mask is not None:
-        data = np.where(pixels.mask, np.nan, data)
-    sky = np.nanmedian(data)
+        good &= ~pixels.mask
+    if not good.any():
+        return 1.0
+    sky = np.median(data[good])
     with np.errstate(invalid='ignore'):
-        clumps, _ = label(data > sky + _BRIGHT * (level - sky), _SQUARE)
+        bright = good & (data > sky + _BRIGHT * (level - sky))
+    clumps, _ = label(bright, _SQUARE)
     clumps[np.isin(clumps, clumps[taken])] = 0
     sizes = _sizes(clumps)
     # Lines of single pixels are cosmic rays and bad columns.

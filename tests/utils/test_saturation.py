@@ -1,4 +1,6 @@
 """Saturated pixels, the trails of their charge, and stars behind them."""
+from dataclasses import replace
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -112,6 +114,14 @@ def test_long_light_is_no_charge(shape, turned, tail, runs):
     ends = {'none': 0, 'columns': np.count_nonzero(np.diff(mask, axis=0)),
             'rows': np.count_nonzero(np.diff(mask, axis=1))}[runs]
     assert good.sum() <= ends
+
+
+def test_light_is_round_where_all_is_masked():
+    data = np.ones((9, 9))
+    data[2:7, 4:7] = 100
+    pixels = replace(read_pixels(data), mask=np.ones((9, 9), bool))
+    np.testing.assert_array_equal(saturated_pixels(pixels, 100),
+                                  mask_of(data, 100))
 
 
 def test_a_plateau_with_noise_is_masked_without_holes():
