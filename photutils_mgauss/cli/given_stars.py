@@ -1,10 +1,6 @@
 """``mgauss photometry --stars``: the stars of a list instead of a search."""
-import numpy as np
-from astropy.table import QTable
-
 from photutils_mgauss.cli import tools
 from photutils_mgauss.cli.catalogues import say_program
-from photutils_mgauss.utils.star_columns import read_sources
 
 _SKY = ('ra', 'dec')
 
@@ -54,6 +50,7 @@ class StarList:
 
     def __init__(self, path, options):
         from photutils_mgauss.files.tables import read_table
+        from photutils_mgauss.utils.star_columns import read_sources
         self.path, self.options = path, options
         self.table, _ = read_table(path)
         say_program(options, path, self.table)
@@ -77,6 +74,8 @@ class StarList:
         Places on the sky go before pixels if the image has a WCS: the list
         may be that of another image.
         """
+        import numpy as np
+        from astropy.table import QTable
         x, y, kind = self._places(image)
         ny, nx = image.data.shape
         with np.errstate(invalid='ignore'):
@@ -114,6 +113,7 @@ class StarList:
 
 def _pixels_of(wcs, directions):
     """Return x, y of unit vectors (3, n), NaN where there is no pixel."""
+    import numpy as np
     from astropy.coordinates import SkyCoord
 
     from photutils_mgauss.sky.wcs import invert_wcs

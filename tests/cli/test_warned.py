@@ -63,7 +63,7 @@ def test_commands_name_the_file_of_a_warning_and_count_the_rest(
         fits.writeto(name, rng.normal(50, 7, (40, 40)).astype('f4'),
                      fits.Header({'BUNIT': 'electron'}))
 
-    def measure(image, psf, options):
+    def measure(image, psf, options, stars):
         for _ in range(2):
             for number in (1, 2):
                 warnings.warn(f'off by {number}', UserWarning, stacklevel=1)
