@@ -95,7 +95,7 @@ def saturated_pixels(pixels, level):
 
 def _axes_of_charge(light, *masks):
     """Return along which axes charge runs, (2,), or None if unknown."""
-    sizes = np.concatenate([_sizes(label(mask, _SQUARE)[0])
+    sizes = np.concatenate([_sizes(find_objects(label(mask, _SQUARE)[0]))
                             for mask in masks])
     sizes = sizes[(sizes >= _LEAST_SIZE).all(axis=1)].sum(axis=0)
     if not sizes.any():
@@ -116,8 +116,9 @@ def _aspect_of_light(pixels, level, taken):
     with np.errstate(invalid='ignore'):
         bright = good & (data > sky + _BRIGHT * (level - sky))
     clumps, _ = label(bright, _SQUARE)
-    clumps[np.isin(clumps, clumps[taken])] = 0
-    sizes = _sizes(clumps)
+    saturated = set(clumps[taken])
+    sizes = _sizes(box for number, box in enumerate(find_objects(clumps), 1)
+                   if number not in saturated)
     # Lines of single pixels are cosmic rays and bad columns.
     sizes = sizes[(sizes >= _LEAST_SIZE).any(axis=1)
                   & (sizes > 1).all(axis=1)]
@@ -126,11 +127,10 @@ def _aspect_of_light(pixels, level, taken):
     return np.exp(steps.sum() / (len(steps) + 1))
 
 
-def _sizes(clumps):
-    """Return how many rows and columns labelled clumps have, (n, 2)."""
+def _sizes(boxes):
+    """Return how many rows and columns boxes have, (n, 2)."""
     return np.array([[side.stop - side.start for side in box]
-                     for box in find_objects(clumps) if box],
-                    int).reshape(-1, 2)
+                     for box in boxes], int).reshape(-1, 2)
 
 
 def without_saturated(pixels, level):
