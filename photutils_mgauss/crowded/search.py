@@ -99,20 +99,28 @@ def leave_out(tile, threshold):
 
 
 def weakest(s, p, strength, threshold, shape):
-    """Tell which stars of a strength (n,) are to go, the weakest first."""
+    """
+    Tell which stars of a strength (n,) are to go, the weakest first.
+
+    And those that have become one with a star that is seen by its wings.
+    """
     weak = ~(strength >= threshold) & ~s.listed
-    near = np.hypot(s.x[p.owner] - s.x[p.neighbour],
-                    s.y[p.owner] - s.y[p.neighbour]) < 2
-    fainter = near & (s.flux[p.neighbour] < s.flux[p.owner])
+    distance = np.hypot(s.x[p.owner] - s.x[p.neighbour],
+                        s.y[p.owner] - s.y[p.neighbour])
+    fainter = (distance < 2) & (s.flux[p.neighbour] < s.flux[p.owner])
     weak[p.owner[fainter & weak[p.neighbour]]] = False
     # Where equations have no solution it is not the brightest that is extra.
     second = np.zeros(len(s), bool)
     second[p.neighbour[fainter]] = True
     weak &= second | ~np.isnan(strength) | ~(s.flux > 0)
+    # By wings alone two stars that come so close cannot be told apart.
+    same = np.zeros(len(s), bool)
+    same[p.owner[(distance < _REJECTED) & s.seeded[p.neighbour]]] = True
+    same &= ~s.seeded
     ny, nx = shape
-    return weak | (~s.listed & (np.maximum(
+    return weak | (~s.listed & (same | (np.maximum(
         np.maximum(-s.x, s.x - nx + 1),
-        np.maximum(-s.y, s.y - ny + 1)) > _OUTSIDE))
+        np.maximum(-s.y, s.y - ny + 1)) > _OUTSIDE)))
 
 
 def _vertex(image, x, y):

@@ -1,4 +1,6 @@
 """What a search finds beside the hidden middles of saturated stars."""
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from astropy.nddata import NDData, StdDevUncertainty
@@ -9,6 +11,8 @@ from photutils_mgauss import (
     GaussianMixture,
     GriddedMixturePSF,
 )
+from photutils_mgauss.crowded.search import weakest
+from photutils_mgauss.crowded.stars import Stars
 
 SKY, FULL, FLUX, TOP = 40.0, 6e4, 2.5e6, 34.8
 ANGLES = 0.3 + 2 * np.pi * np.arange(5) / 5
@@ -84,3 +88,16 @@ def test_it_is_the_same_in_many_images():
     assert np.abs(np.asarray(star['x_fit']) - 35).max() < 0.01
     assert np.abs(np.asarray(star['y_fit']) - TOP).max() < 0.01
     np.testing.assert_allclose(np.asarray(star['flux']), FLUX, rtol=0.03)
+
+
+@pytest.mark.parametrize(('distance', 'seeded', 'listed', 'goes'), [
+    (0.4, True, False, True), (0.4, True, True, False),
+    (0.4, False, False, False), (0.7, True, False, False)])
+def test_what_becomes_one_with_a_star_seen_by_its_wings_goes(
+        distance, seeded, listed, goes):
+    stars = Stars([20, 20 + distance], [20, 20], [1e6, 4e5],
+                  seeded=[seeded, False], number=[-1, 3 if listed else -1])
+    pairs = SimpleNamespace(owner=np.array([0, 1]),
+                            neighbour=np.array([1, 0]))
+    weak = weakest(stars, pairs, np.array([900.0, 300.0]), 5.0, (40, 40))
+    assert weak.tolist() == [False, goes]
