@@ -2,6 +2,7 @@
 from dataclasses import replace
 
 import numpy as np
+from astropy.stats import mad_std
 from scipy.ndimage import (
     binary_dilation,
     binary_propagation,
@@ -24,8 +25,10 @@ _PLATEAU = 0.9
 # so many times longer that way than light is.
 _LEAST_SIZE, _LONGER = 3, 1.5
 # What light is like is seen where unsaturated stars have more than this
-# fraction of the level.
-_BRIGHT = 0.1
+# fraction of the level, and are so many times as bright as the noise.
+_BRIGHT, _ABOVE_NOISE = 0.1, 5.0
+# Of so many pixels sky and noise are known well enough.
+_ENOUGH = 100_000
 
 
 def as_saturation(value):
@@ -50,7 +53,8 @@ def saturated_pixels(pixels, level):
     Those at the level or above, those next to them that nearly are, and those
     that their charge has run into along rows or columns, with a pixel beyond
     both ends of these. Charge runs where clumps are much longer along an axis
-    than the light of unsaturated stars of a tenth of the level or more;
+    than the light of unsaturated stars of a tenth of the level and five
+    times the noise or more;
     without such stars, light counts as round. Where clumps are too small to
     say whether and along which of both charge runs, a pixel all around is of
     no use, too. Other pixels beside saturated ones tell most of where a star
@@ -112,9 +116,12 @@ def _aspect_of_light(pixels, level, taken):
         good &= ~pixels.mask
     if not good.any():
         return 1.0
-    sky = np.median(data[good])
+    some = data[good]
+    some = some[::max(1, some.size // _ENOUGH)]
+    sky = np.median(some)
+    least = max(_BRIGHT * (level - sky), _ABOVE_NOISE * mad_std(some))
     with np.errstate(invalid='ignore'):
-        bright = good & (data > sky + _BRIGHT * (level - sky))
+        bright = good & (data > sky + least)
     clumps, _ = label(bright, _SQUARE)
     saturated = set(clumps[taken])
     sizes = _sizes(box for number, box in enumerate(find_objects(clumps), 1)

@@ -116,6 +116,16 @@ def test_long_light_is_no_charge(shape, turned, tail, runs):
     assert good.sum() <= ends
 
 
+@pytest.mark.parametrize('seed', range(4))
+def test_noise_is_no_light(seed):
+    data = np.random.default_rng(seed).normal(100, 20, (14, 90))
+    data[5:10, 40:48] = 400
+    mask = mask_of(data, 400)
+    # Charge along rows, with a pixel beyond its ends.
+    assert mask[5:10, [39, 48]].all()
+    assert not mask[[4, 10]].any()
+
+
 def test_light_is_round_where_all_is_masked():
     data = np.ones((9, 9))
     data[2:7, 4:7] = 100
