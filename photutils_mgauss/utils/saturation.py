@@ -53,12 +53,11 @@ def saturated_pixels(pixels, level):
     Those at the level or above, those next to them that nearly are, and those
     that their charge has run into along rows or columns, with a pixel beyond
     both ends of these. Charge runs where clumps are much longer along an axis
-    than the light of unsaturated stars of a tenth of the level and five
-    times the noise or more;
-    without such stars, light counts as round. Where clumps are too small to
-    say whether and along which of both charge runs, a pixel all around is of
-    no use, too. Other pixels beside saturated ones tell most of where a star
-    is, and are left.
+    than the light of unsaturated stars of a tenth of the level and five times
+    the noise or more; without such stars, light counts as round. Where clumps
+    are too small to say whether and along which of both charge runs, a pixel
+    all around is of no use, too. Other pixels beside saturated ones tell most
+    of where a star is, and are left.
 
     Parameters
     ----------
