@@ -152,11 +152,11 @@ def measure(image, psf, options, stars=None):
         given = None if stars is None else stars.in_image(image)
         table = (_crowded if options.crowded else _sparse)(
             image, psf, options, given)
-        if given is not None:
-            table['id'] = given['id']
         if table is None or len(table) == 0:
             msg = 'must show a star, got none; try --threshold'
             raise ValueError(msg)
+        if given is not None:
+            table['id'] = given['id']
         _check_fits(image, table)
         table = _with_flux_density(_with_unit(table, image.unit), image,
                                    options)

@@ -218,12 +218,13 @@ class Workers:
 
 def equations(problem, coefficients, workers):
     """Form the normal equations at the coefficients."""
-    shares = problem.shares()
+    shares, weights = problem.shares(), problem.weights
+    if (shares != 1).any():  # else all weights would be copied at each step
+        weights = weights * shares[:, None, None]
     parts = workers.map(
         _PartEquations(coefficients, problem.fit_sky, problem.form,
                        problem.pixel_integrated),
-        len(problem.basis), problem.stamps.data,
-        problem.weights * shares[:, None, None],
+        len(problem.basis), problem.stamps.data, weights,
         problem.stamps.corners, problem.basis, problem.local,
         problem.sources, problem.anchors, problem.hold, problem.n_sources,
         problem.sky, problem.used)
