@@ -78,6 +78,14 @@ OWNERS = {name: owner.replace('.', '/')
           for name, owner in photutils_mgauss._OWNERS.items()}
 
 
+@cache
+def imports(tree):
+    """Return the import statements of a tree, a few nodes of very many."""
+    return [node for node in ast.walk(tree)
+            if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
+@cache
 def exceptions(tree):
     """
     Return the imports that may go up.
@@ -88,9 +96,8 @@ def exceptions(tree):
     return {node for function in ast.walk(tree)
             if isinstance(function, ast.FunctionDef)
             and function.name.startswith(('plot', 'from_'))
-            for node in ast.walk(function)
-            if isinstance(node, ast.Import | ast.ImportFrom)
-            and {room_of(name) for name in own_modules(node)}
+            for node in imports(function)
+            if {room_of(name) for name in own_modules(node)}
             <= ({'plotting'} if function.name.startswith('plot')
                 else {'fitting', 'field'})}
 
@@ -100,7 +107,7 @@ def upward_imports(name, tree):
     allowed, room = exceptions(tree), room_of(name)
     return [f'{name} (floor {FLOORS[room]}) imports {other} '
             f'(floor {FLOORS[room_of(other)]}) in line {node.lineno}'
-            for node in ast.walk(tree) if node not in allowed
+            for node in imports(tree) if node not in allowed
             for other in own_modules(node) if room_of(other) != room
             and FLOORS[room_of(other)] >= FLOORS[room]]
 
@@ -108,7 +115,7 @@ def upward_imports(name, tree):
 def all_imports(tree):
     """Return the modules of ours that a module imports, now or later."""
     allowed = exceptions(tree)
-    return set().union(*(own_modules(node) for node in ast.walk(tree)
+    return set().union(*(own_modules(node) for node in imports(tree)
                          if node not in allowed))
 
 
@@ -161,7 +168,7 @@ def test_tests_stand_in_the_rooms_of_what_they_test():
 @pytest.mark.parametrize('path', [
     pytest.param(path, id=path.stem) for path in TESTS.rglob('*.py')])
 def test_no_test_module_is_imported(path):
-    names = [name for node in ast.walk(ast.parse(path.read_text('utf-8')))
+    names = [name for node in imports(ast.parse(path.read_text('utf-8')))
              for name in imported_names(node)]
     assert not [name for name in names if name.startswith('test_')
                 or '.test_' in name]
@@ -176,7 +183,7 @@ def test_no_two_modules_import_each_other():
 def test_the_halves_meet_only_in_the_table_between_them(name):
     half = ROWS[room_of(name)]['Half']
     strangers = {'image': 'sky', 'sky': 'image'}.get(half)
-    others = set().union(*map(own_modules, ast.walk(parse(name))))
+    others = set().union(*map(own_modules, imports(parse(name))))
     assert name in BOTH_HALVES or not [
         other for other in others
         if strangers and ROWS[room_of(other)]['Half'] == strangers]
@@ -186,7 +193,7 @@ def test_the_halves_meet_only_in_the_table_between_them(name):
     'name', [name for name in MODULES if name not in BOTH_HALVES
              and ROWS[room_of(name)]['Half'] == 'image'])
 def test_the_image_half_knows_nothing_of_sky_and_time(name):
-    names = [word for node in ast.walk(parse(name))
+    names = [word for node in imports(parse(name))
              for word in imported_names(node)]
     assert not [word for word in names if word.startswith(SKY_PACKAGES)]
 

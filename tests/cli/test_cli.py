@@ -205,6 +205,7 @@ def test_the_page_needs_no_other_file(chain):
     assert page.count('<img alt="') == page.count('<figcaption>')
 
 
+@pytest.mark.long
 def test_images_become_motions_in_one_command(chain):
     run = succeed('motions', 'images/night1.fits', 'images/night2.fits',
                   '--n-components', 3, '--degree', 1, '--output', 'direct',

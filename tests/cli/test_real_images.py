@@ -48,6 +48,7 @@ def lorri(realdata, tmp_path, monkeypatch, capsys):
     return QTable.read(folder / 'positions.ecsv')
 
 
+@pytest.mark.long
 def test_proxima_is_where_it_was_published_and_as_far_away(lorri, capsys):
     said = capsys.readouterr().err
     assert said.count('pixels are negative and have the error 0') == 12
@@ -87,6 +88,7 @@ def test_proxima_is_where_it_was_published_and_as_far_away(lorri, capsys):
     assert abs(star['parallax'].to_value(u.mas) - PARALLAX) < 1.5 * error
 
 
+@pytest.mark.long
 def test_a_crowded_infrared_image_becomes_a_catalogue(realdata, tmp_path,
                                                       monkeypatch):
     folder = realdata('spitzer_glimpse')

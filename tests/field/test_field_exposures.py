@@ -131,6 +131,7 @@ def test_one_exposure_in_a_list_is_one_exposure(exposures):
     assert listed.exposures is None
 
 
+@pytest.mark.long
 def test_cross_validation_takes_exposures(exposures):
     data, stars, error = exposures
     field = fit_mixture_field(data, stars, error=error, n_components=2,

@@ -108,6 +108,7 @@ def test_integrated_images_are_those_of_integrated_mixtures(field):
     assert_allclose(found, expected, atol=1e-3 * expected.max())
 
 
+@pytest.mark.long
 def test_few_directions_hold_what_the_whole_covariance_does(scene, field):
     """Fields along all axes of the covariance move stars as it says."""
     clean, error, _, test = scene

@@ -117,6 +117,7 @@ def test_bad_arguments_are_named(image, arguments, words):
         sample_mixture(image, **{'n_components': 2, **arguments})
 
 
+@pytest.mark.long
 def test_the_noise_may_be_small(image):
     faint = 50 * TRUTH.render((15, 15), 7, 7)
     faint += 1e-9 * (image - faint)

@@ -65,6 +65,7 @@ def test_an_edit_of_a_function_called_from_another_file_is_noticed(
     assert run(copy, **cache).stdout.strip() == '3.0'
 
 
+@pytest.mark.long
 def test_without_a_folder_for_it_code_is_compiled_and_one_warning_given(
         copy, tmp_path):
     for place in list(copy.rglob('__pycache__')):
@@ -181,6 +182,7 @@ if __name__ == '__main__':
     assert found.stdout == '[]\n'
 
 
+@pytest.mark.long
 def test_no_kernel_is_compiled_for_integers_besides_floats():
     code = """
 from photutils_mgauss.cli.compile_command import examples

@@ -129,6 +129,7 @@ def test_a_tile_is_the_integral_over_its_pixels(shape, size):
         assert_allclose(found[1:], exact[1:], atol=2e-7 * peak / width)
 
 
+@pytest.mark.long
 def test_the_slope_of_a_blend_is_right_at_a_node():
     nodes = [GaussianMixture.from_stddevs([1], [[0, 0]], [[sx, 0.5]], [0.2])
              for sx in (0.3, 0.5, 0.4, 0.6)]
