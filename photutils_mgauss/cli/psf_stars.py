@@ -44,14 +44,10 @@ def choose(image, radius, options):
     if options.stars is not None:
         sources, _ = read_table(options.stars)
         say_program(options, options.stars, sources)
-    saturation = image.saturation
-    if saturation is not None:
-        # The level is that of the image with its sky.
-        saturation -= float(image.sky.background_median)
     return select_psf_stars(
         image.without_sky, sources, error=image.noise.total, mask=image.mask,
-        radius=radius, saturation=saturation, min_snr=options.min_snr,
-        max_stars=options.max_stars)
+        radius=radius, saturation=image.saturation_without_sky,
+        min_snr=options.min_snr, max_stars=options.max_stars)
 
 
 def no_stars(image, stars):

@@ -4,13 +4,16 @@ Images of stars from files, ready to be measured.
 An image needs the noise of its pixels. Where its file does not have it, it
 follows from sky, readout and gain (Eq. 10 of Nie et al.).
 """
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from astropy.utils.exceptions import AstropyUserWarning
 from photutils.background import Background2D
 from photutils.utils import calc_total_error
+from scipy.ndimage import label
 
 from photutils_mgauss.files.image_header import (
     electrons_in_unit,
@@ -24,6 +27,9 @@ from photutils_mgauss.utils.saturation import without_saturated
 
 # The sky is not measured in boxes with a larger share of bad pixels [%].
 _BAD_SHARE = 50.0
+# So many pixels side by side, and not more than this share of an image, do
+# not have its highest value by chance.
+_FEW, _MOST = 4, 0.05
 
 
 @dataclass(frozen=True)
@@ -131,7 +137,19 @@ class StarImage:
     @property
     def saturation(self):
         """The level of saturated pixels, or None."""
-        return self._or_header('saturation')
+        return self._saturation[0]
+
+    @cached_property
+    def _saturation(self):
+        """The level of saturated pixels, and what says so."""
+        if self.reading.saturation is not None:
+            return self.reading.saturation, '--saturation says'
+        level, largest = self.layers.cards.saturation, self.layers.largest
+        if (largest is not None and (level is None or level > largest)
+                and np.any(self.data[~self.mask] >= largest)):
+            return largest, (f'the numbers of {self.layers.bits} bits in the '
+                             'file say')
+        return level, 'the header says'
 
     @property
     def saturation_without_sky(self):
@@ -149,11 +167,27 @@ class StarImage:
 
     def say_saturation(self):
         """Return a sentence on what is saturated."""
-        source = ('--saturation' if self.reading.saturation is not None
-                  else 'the header')
-        n = int(np.count_nonzero(self.data >= self.saturation))
-        return (f'pixels from {self.saturation:g} on are saturated, as '
-                f'{source} says: {n} of them')
+        level, source = self._saturation
+        n = int(np.count_nonzero(self.data >= level))
+        return (f'pixels from {level:g} on are saturated, as {source}: {n} '
+                'of them')
+
+    def warn_of_flat_tops(self):
+        """Warn of pixels that look saturated, if no level says so."""
+        data = np.where(self.mask, -np.inf, self.data)
+        highest = data.max()
+        top = data == highest
+        n = np.count_nonzero(top)
+        if (not _FEW <= n <= _MOST * top.size
+                or (self.saturation or np.inf) <= highest):
+            return
+        clumps, _ = label(top, np.ones((3, 3)))
+        if np.bincount(clumps[top]).max() >= _FEW:
+            warnings.warn(
+                f'{self.path}: {n} pixels share the highest value, '
+                f'{highest:.8g}, some side by side; if they are saturated, '
+                f'give --saturation {highest:.8g}', AstropyUserWarning,
+                stacklevel=3)
 
     def _or_header(self, name):
         own = getattr(self.reading, name)
@@ -176,7 +210,13 @@ class StarImage:
     @cached_property
     def without_sky(self):
         """The values less the sky, 0 at bad pixels, (ny, nx)."""
-        return np.where(self.mask, 0, self.data - self.sky.background)
+        values = self.data - self.sky.background
+        level = self.saturation_without_sky
+        if level is not None:
+            # Full pixels stay full where the sky is brighter than elsewhere.
+            full = self.data >= self.saturation
+            values[full] = np.maximum(values[full], level)
+        return np.where(self.mask, 0, values)
 
     @property
     def electrons(self):
@@ -240,8 +280,14 @@ class StarImage:
         words.append('no WCS' if self.wcs is None else
                      f'{type(self.wcs).__module__.split(".")[0]} WCS')
         words.append('no time' if self.time is None else
-                     f'{julian_years(self.time):.3f}')
+                     f'{julian_years(self.time):.3f}{self._say_day()}')
         return f'{self.path}: {"; ".join(words)}'
+
+    def _say_day(self):
+        known = (self.reading.time is not None
+                 or self.reading.time_key is not None)
+        return ('' if known or not self.layers.cards.has_only_a_day
+                else ' (a date without time of day)')
 
 
 def read_image(path, reading=None):
@@ -270,4 +316,6 @@ def read_image(path, reading=None):
               for kind in ('error', 'weight', 'flags')}
     layers = read_layers(path, ext=reading.ext, error_ext=reading.error_ext,
                          flags_ext=reading.flags_ext, beside=beside)
-    return StarImage(path, layers, reading)
+    image = StarImage(path, layers, reading)
+    image.warn_of_flat_tops()
+    return image

@@ -353,9 +353,10 @@ def output_names(inputs, output, ending, suffixes, default):
 def stem(path):
     """Return the name of a file without folder and suffixes."""
     name = Path(path).name
-    for suffix in ('.gz', '.fz', '.fits', '.fit', '.asdf', '.ecsv', '.psf',
-                   '_cat'):
-        name = name.removesuffix(suffix)
+    for suffix in ('.gz', '.fz', '.bz2', '.xz', '.zip', '.fits', '.fit',
+                   '.fts', '.asdf', '.ecsv', '.psf', '_cat'):
+        if name.lower().endswith(suffix):
+            name = name[:-len(suffix)]
     return name
 
 

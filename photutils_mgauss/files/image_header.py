@@ -13,6 +13,7 @@ _READ_NOISE = ('RDNOISE', 'READNOIS', 'RON', 'READNSEA')
 _EXPOSURE_TIME = ('EXPTIME', 'XPOSURE', 'EFFEXPTM', 'TEXPTIME', 'EXPOSURE')
 # MJy/sr for one DN/s.
 _CONVERSION = ('PHOTMJSR', 'FLUXCONV')
+_START = ('EXPSTART', 'MJD-BEG', 'MJD-OBS')
 _SATURATION = ('SATURATE', 'SATLEVEL', 'SATURAT')
 
 # Numbers in headers are smaller, which leaves out infinity.
@@ -31,6 +32,13 @@ _NUMBER = re.compile(r'(JD|MJD|J)?\s*=?\s*(\d+\.?\d*(?:E\+?\d+)?)')
 _RANGES = {'jd': (2_400_000.5, 2_500_000), 'mjd': (15_000, 99_999.5),
            'jyear': (1858, 2200)}
 _PREFIX = {'jd': 'JD', 'mjd': 'MJD', 'jyear': 'J'}
+# Day, month and year of the twentieth century, as FITS had dates before 1999;
+# no camera with pixels is older than 1970.
+_OLD_DATE = re.compile(r'^(\d\d)/(\d\d)/([7-9]\d)$')
+_SLASHES = re.compile(r'^(\d{4})/(\d\d)/(\d\d)')
+# A number in a card of text.
+_TEXT_NUMBER = re.compile(
+    r'[+-]?(\d+\.?\d*|\.\d+)([ED][+-]?\d+)?', re.IGNORECASE)
 _RATE = re.compile(r'(.+?)(?:/s(?:ec)?|\*?\*?s(?:\^|\*\*)?-1)')
 
 
@@ -71,7 +79,7 @@ class Cards:
     def number(self, *keys):
         """Return the first finite number there is, or None."""
         for key in keys:
-            value = self.get(key)
+            value = _from_text(self.get(key))
             if (isinstance(value, (int, float, np.number))
                     and not isinstance(value, bool) and abs(value) < _HUGE):
                 return float(value)
@@ -133,6 +141,16 @@ class Cards:
                 return time
         return None
 
+    @property
+    def has_only_a_day(self):
+        """Whether the time of the exposure is a date without its hour."""
+        if any(_believable(find, self, self._scale) is not None
+               for find in (_middle, _middle_of_limits)):
+            return False
+        date = _date_text(self)
+        return (self.number(*_START) is None and date is not None
+                and ':' not in str(date))
+
     def time_at(self, key):
         """
         Return the time that a keyword of the user's choice has.
@@ -155,6 +173,13 @@ class Cards:
         except ValueError as error:
             msg = f'the keyword {key} must have a time: {error}'
             raise ValueError(msg) from error
+
+
+def _from_text(value):
+    """Return the number that a text is, or the value as it is."""
+    if isinstance(value, str) and _TEXT_NUMBER.fullmatch(value.strip()):
+        return float(value.upper().replace('D', 'E'))
+    return value
 
 
 def _value(header, key):
@@ -269,7 +294,7 @@ def _middle_of_limits(cards, scale):
 
 
 def _start_and_length(cards, scale):
-    mjd = cards.number('EXPSTART', 'MJD-BEG', 'MJD-OBS')
+    mjd = cards.number(*_START)
     start = (Time(mjd, format='mjd', scale=scale) if mjd is not None
              else _date(_date_text(cards), scale))
     if start is None:
@@ -279,10 +304,14 @@ def _start_and_length(cards, scale):
 
 def _date_text(cards):
     date = cards.get('DATE-BEG', 'DATE-OBS')
-    time = cards.get('TIME-OBS', 'UTC-OBS', 'UTSTART')
-    if date is None or 'T' in str(date) or time is None:
+    time = cards.get('TIME-OBS', 'UTC-OBS', 'UTSTART', 'UT', 'UTC')
+    if date is None or 'T' in str(date):
         return date
-    return f'{date}T{time}'
+    date = _OLD_DATE.sub(r'19\3-\2-\1', str(date).strip())
+    date = _SLASHES.sub(r'\1-\2-\3', date)
+    if time is None:
+        return date
+    return f'{date}T{str(time).strip()}'
 
 
 def _date(text, scale):

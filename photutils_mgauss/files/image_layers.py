@@ -30,11 +30,16 @@ _NOISE = {'ERR': 'error', 'ERROR': 'error', 'UNCERT': 'error',
           'IVAR': 'weight', 'INVVAR': 'weight', 'WEIGHT': 'weight'}
 _FLAGS = ('DQ', 'FLAG', 'FLAGS', 'MASK')
 
+# Axes of an image, and the largest numbers of few bits, by BITPIX.
+_DIMENSIONS = 2
+_LARGEST = {8: 255, 16: 32767}
+
 # Endings of the names of files beside an image, and what is in them.
 _BESIDE = {'err': 'error', 'rms': 'error', 'sigma': 'error',
            'var': 'variance', 'wht': 'weight', 'weight': 'weight',
            'ivar': 'weight', 'flg': 'flags', 'flag': 'flags',
            'flags': 'flags', 'dq': 'flags', 'mask': 'flags'}
+_PACKED = ('.gz', '.fz', '.bz2', '.xz', '.zip')
 _OWN_ENDINGS = ('_img', '_sci', '-img', '-sci')
 
 # Bits that do not make a pixel bad, as astropy.nddata.bitmask takes them. Of
@@ -52,7 +57,9 @@ class Layers:
     What the files of an image hold, as arrays of one shape.
 
     ``error`` and ``flags`` may be None, ``wcs`` too; ``sources`` names where
-    each of them was found.
+    each of them was found. ``bits`` are those of a pixel in the file and
+    ``largest`` is the value above which they hold none, if they are few
+    enough to be filled.
     """
 
     data: np.ndarray
@@ -62,6 +69,8 @@ class Layers:
     cards: Cards
     wcs: object
     sources: dict
+    bits: int | None = None
+    largest: float | None = None
 
     def mask(self, good_bits):
         """Return True where a pixel must not be used."""
@@ -147,6 +156,7 @@ def with_all_errors(path, layers):
 def _read_fits(path, ext, named):
     with open_fits(path, _IMAGE) as hdus:
         hdu = _science(path, hdus, ext)
+        bits, largest = _range(hdu.header)
         data = _plane(path, hdu)
         sources = {'image': label_of(hdus, hdu)}
         error = (_named(path, hdus, named, sources, 'error')
@@ -156,7 +166,7 @@ def _read_fits(path, ext, named):
             error = to_error(_plane(path, error), kind)
         flags = (_named(path, hdus, named, sources, 'flags')
                  or _first(path, hdus, hdu, _FLAGS, sources, 'flags'))
-        flags = None if flags is None else np.array(flags.data)
+        flags = None if flags is None else _flat(flags.data)
         weight = _first(path, hdus, hdu, ('WHT',), {}, 'weight')
         covered = None if weight is None else _plane(path, weight) > 0
         cards = Cards(hdu.header, hdus[0].header)
@@ -170,7 +180,8 @@ def _read_fits(path, ext, named):
         # Stars can be measured without it.
         warnings.warn(f'{path}: has {problem}; it is left out',
                       AstropyUserWarning, stacklevel=2)
-    layers = Layers(data, error, flags, covered, cards, wcs, sources)
+    layers = Layers(data, error, flags, covered, cards, wcs, sources, bits,
+                    largest)
     for name in ('error', 'flags', 'covered'):
         _check_shape(path, getattr(layers, name), layers, name)
     return layers
@@ -218,7 +229,8 @@ def _science(path, hdus, ext):
     if len(found) == 1:
         return found[0]
     if not found:
-        msg = f'{path}: must hold an image of 2 dimensions, got none'
+        msg = (f'{path}: must hold an image of 2 dimensions, got '
+               f'{_other_arrays(hdus)}')
         raise ValueError(msg)
     names = ', '.join(label_of(hdus, hdu) for hdu in found)
     msg = (f'{path}: --ext must say which image to take, for there are '
@@ -226,8 +238,34 @@ def _science(path, hdus, ext):
     raise ValueError(msg)
 
 
+def _other_arrays(hdus):
+    """Say what arrays there are that are no images."""
+    sizes = [' x '.join(map(str, _axes(hdu))) for hdu in hdus
+             if hdu.is_image and _axes(hdu)]
+    return f'one of {", ".join(sizes)} pixels' if sizes else 'none'
+
+
+def _axes(hdu):
+    """Return the lengths of the axes of an array."""
+    return [hdu.header.get(f'NAXIS{k}')
+            for k in range(1, hdu.header.get('NAXIS', 0) + 1)]
+
+
 def _is_image(hdu):
-    return hdu.is_image and hdu.header.get('NAXIS') == 2
+    """Tell whether it has two axes, besides those of length 1."""
+    if not hdu.is_image or hdu.header.get('NAXIS', 0) < _DIMENSIONS:
+        return False
+    return all(n == 1 for n in _axes(hdu)[_DIMENSIONS:])
+
+
+def _range(header):
+    """Return the bits of a pixel, and its largest value if they are few."""
+    bits = header.get('BITPIX')
+    if bits not in _LARGEST:
+        return bits, None
+    scale, zero = map(Cards(header).number, ('BSCALE', 'BZERO'))
+    scale = 1.0 if scale is None else scale
+    return bits, scale * _LARGEST[bits] + (zero or 0) if scale > 0 else None
 
 
 def _chosen(path, hdus, images, ext, option='--ext'):
@@ -242,10 +280,16 @@ def _chosen(path, hdus, images, ext, option='--ext'):
 
 def _plane(path, hdu):
     data = hdu.data
-    if data is None or data.ndim != 2 or data.dtype.kind not in 'iuf':
+    if (data is None or data.ndim < _DIMENSIONS
+            or data.dtype.kind not in 'iuf'):
         msg = f'{path}: must hold an image of 2 dimensions, got {data!r:.80}'
         raise ValueError(msg)
-    return np.array(data, dtype=float)
+    return _flat(data).astype(float)
+
+
+def _flat(data):
+    """Return an array without its axes of length 1 before the last two."""
+    return np.array(data).reshape(data.shape[-_DIMENSIONS:])
 
 
 def _first(path, hdus, science, names, sources, what):
@@ -485,7 +529,7 @@ def _role(kind):
 def _companions(path):
     """Return the files beside an image that say by name what they are."""
     stem, suffix = path.name, ''.join(path.suffixes[-2:])
-    suffix = suffix if suffix.endswith(('.gz', '.fz')) else path.suffix
+    suffix = suffix if suffix.endswith(_PACKED) else path.suffix
     stem = stem.removesuffix(suffix)
     for own in _OWN_ENDINGS:
         stem = stem.removesuffix(own)
@@ -503,7 +547,7 @@ def _add_companion(layers, kind, file):
         if len(images) != 1:
             msg = f'{file}: must hold one image, got {len(images)}'
             raise ValueError(msg)
-        values = (np.array(images[0].data) if kind == 'flags'
+        values = (_flat(images[0].data) if kind == 'flags'
                   else _plane(file, images[0]))
     _check_shape(file, values, layers, kind)
     sources = {**layers.sources, _role(kind): file.name}

@@ -1,4 +1,6 @@
 """The level of saturation on the command line and in headers."""
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -6,6 +8,8 @@ from astropy.table import QTable
 
 from photutils_mgauss import GaussianMixture, GriddedMixturePSF
 from photutils_mgauss.cli import main
+from photutils_mgauss.cli.psf_stars import choose
+from photutils_mgauss.cli.star_image import Reading, read_image
 
 MIXTURE = GaussianMixture([0.7, 0.3], [(0, 0), (0, 0)],
                           [[[0.9, 0.1], [0.1, 0.8]], [[4, 0], [0, 4]]])
@@ -25,6 +29,10 @@ def folder(tmp_path_factory):
     fits.writeto(folder / 'header.fits', data, header)
     del header['SATURATE']
     fits.writeto(folder / 'plain.fits', data, header)
+    # As 16-bit cameras write it, brighter than its median at the star.
+    slope = 400 * (abs(np.arange(100) - 47) < 20)[:, None] * np.ones(100)
+    shown = np.minimum(rng.poisson(light[::-1] + slope), 65535)
+    fits.writeto(folder / 'slope.fits', shown.astype('u2'), header)
     return folder
 
 
@@ -48,6 +56,33 @@ def test_a_saturated_star_is_measured_and_said(folder, capsys, image,
     star = table[near][np.argmax(table['flux_fit'][near])]
     assert np.hypot(star['x_fit'] - X, star['y_fit'] - Y) < 0.05
     assert star['flags'] & 65536
+
+
+def test_a_sky_that_varies_hides_no_full_pixels(folder, capsys):
+    image = read_image(folder / 'slope.fits', Reading(sky_box=10))
+    full = image.data == 65535
+    assert full.sum() >= 4
+    assert np.all(image.sky.background[full]
+                  > 200 + image.sky.background_median)
+    assert np.all(image.without_sky[full] >= image.saturation_without_sky)
+    output = folder / 'slope.ecsv'
+    main(['photometry', str(folder / 'slope.fits'), '--psf',
+          str(folder / 'psf.fits'), '--sky-box', '10', '--output',
+          str(output)])
+    table = QTable.read(output)
+    y = 99 - Y
+    star, = table[np.hypot(table['x_fit'] - X, table['y_fit'] - y) < 8]
+    assert star['flags'] & 65536
+    assert np.hypot(star['x_fit'] - X, star['y_fit'] - y) < 0.05
+    assert abs(star['flux_fit'] / 1e6 - 1) < 0.02
+
+
+def test_saturated_stars_beneath_a_bright_sky_are_not_for_the_psf(folder):
+    image = read_image(folder / 'slope.fits', Reading(sky_box=10))
+    options = SimpleNamespace(stars=None, min_snr=50, max_stars=100)
+    stars = choose(image, 8, options)
+    star, = stars[np.hypot(stars['x'] - X, stars['y'] - 99 + Y) < 3]
+    assert star['reason'] == 'saturated'
 
 
 @pytest.mark.parametrize('how', [[], ['--crowded']])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.time import Time
+from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_allclose
 
 from photutils_mgauss import Instrument, paper_exposures
@@ -260,6 +261,14 @@ def test_a_wcs_file_wins(tmp_path, sky, gwcs, tan):
      Time('2026-01-02T03:04:10')),
     ({'DATE-BEG': '2026-01-02T00:00:00', 'DATE-END': '2026-01-02T02:00:00'},
      Time('2026-01-02T01:00:00')),
+    ({'DATE-OBS': '2026-01-02', 'UT': '03:04:05.0'},
+     Time('2026-01-02T03:04:05')),
+    ({'DATE-OBS': '2026/01/02', 'UTC': '03:04:05'},
+     Time('2026-01-02T03:04:05')),
+    # Before 1999 FITS wrote days, months and two digits of the year.
+    ({'DATE-OBS': '04/03/96', 'UT': ' 5:06:07', 'EXPTIME': '10.0'},
+     Time('1996-03-04T05:06:12')),
+    ({'DATE-OBS': '04/03/26'}, None),
     ({'DATE-OBS': 'yesterday'}, None), ({}, None)])
 def test_the_middle_of_the_exposure_is_found(cards, expected):
     time = Cards(cards).time
@@ -268,6 +277,97 @@ def test_the_middle_of_the_exposure_is_found(cards, expected):
     else:
         assert time.scale == expected.scale
         assert abs(time - expected) < 1 * u.ms
+
+
+@pytest.mark.parametrize(('cards', 'words'), [
+    ({'DATE-OBS': '2026-01-02'}, '2026.003 (a date without time of day)'),
+    ({'DATE-OBS': '04/03/96'}, '1996.171 (a date without time of day)'),
+    ({'DATE-OBS': '2026-01-02T00:00:00'}, '2026.003'),
+    ({'DATE-OBS': '2026-01-02', 'UT': '00:00:00'}, '2026.003'),
+    ({'DATE-OBS': '2026-01-02', 'MJD-OBS': 61042.0}, '2026.003')])
+def test_a_date_without_time_of_day_is_said(tmp_path, sky, cards, words):
+    fits.PrimaryHDU(sky, header(**cards)).writeto(tmp_path / 'a.fits')
+    assert read_image(tmp_path / 'a.fits').describe().endswith(f'; {words}')
+
+
+@pytest.mark.parametrize(('value', 'number'), [
+    ('1.7', 1.7), (' 2 ', 2.0), ('1.7 e/ADU', None), ('nan', None),
+    ('inf', None), ('-3', None), ('1_0', None)])
+def test_a_number_written_as_text_is_a_number(value, number):
+    assert Cards({'GAIN': value}).gain == number
+
+
+@pytest.mark.parametrize(('kind', 'level', 'cards'), [
+    ('u2', 65535, {}), ('i2', 32767, {}), ('u1', 255, {}),
+    ('u2', 65535, {'SATURATE': 70000.0})])
+def test_full_pixels_of_short_integers_are_saturated(
+        tmp_path, sky, kind, level, cards):
+    sky = sky.astype(kind)
+    fits.writeto(tmp_path / 'none.fits', sky, header(**cards))
+    assert read_image(tmp_path / 'none.fits').saturation == cards.get(
+        'SATURATE')
+    sky[20:22, 30] = level
+    fits.writeto(tmp_path / 'full.fits', sky, header(**cards))
+    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(
+        sky, header(**cards))]).writeto(tmp_path / 'full.fits.fz')
+    for name in ('full.fits', 'full.fits.fz'):
+        image = read_image(tmp_path / name)
+        assert image.saturation == level
+        assert image.say_saturation() == (
+            f'pixels from {level} on are saturated, as the numbers of '
+            f'{8 * sky.itemsize} bits in the file say: 2 of them')
+    assert read_image(tmp_path / 'full.fits',
+                      Reading(saturation=120.0)).saturation == 120
+    # What flags have told already needs no level.
+    fits.writeto(tmp_path / 'full_mask.fits', (sky == level).astype('u1'))
+    assert read_image(tmp_path / 'full.fits').saturation == cards.get(
+        'SATURATE')
+
+
+def test_scaled_integers_are_full_where_their_numbers_are(tmp_path, sky):
+    hdu = fits.PrimaryHDU(sky)
+    hdu.data[5, 6] = 500.5
+    hdu.scale('int16', bscale=0.01, bzero=172.83)
+    hdu.writeto(tmp_path / 'a.fits')
+    assert_allclose(read_image(tmp_path / 'a.fits').saturation, 500.5)
+
+
+def test_flat_tops_without_a_level_are_told(tmp_path, sky):
+    sky[20:24, 30:32] = 4000
+    sky[50, 8] = 4000
+    fits.writeto(tmp_path / 'a.fits', sky)
+    with pytest.warns(AstropyUserWarning, match=(
+            r'a\.fits: 9 pixels share the highest value, 4000, some side by '
+            'side; if they are saturated, give --saturation 4000')):
+        read_image(tmp_path / 'a.fits')
+    read_image(tmp_path / 'a.fits', Reading(saturation=3999.0))
+    fits.writeto(tmp_path / 'b.fits', sky, header(SATURATE=4000.0))
+    read_image(tmp_path / 'b.fits')
+
+
+def test_axes_of_length_one_are_no_axes(tmp_path, sky, tan):
+    flags = (sky > 120).astype('u1')
+    third = {'CTYPE3': 'WAVE', 'CRVAL3': 5e-7, 'CUNIT3': 'm', 'CRPIX3': 1.0,
+             'CDELT3': 1e-8}
+    write_layers(tmp_path / 'a.fits', sky[None], None,
+                 {'ERR': sky[None, None] / 10, 'DQ': flags[None]},
+                 {**tan, **third})
+    image = read_image(tmp_path / 'a.fits')
+    assert_allclose(image.data, sky)
+    assert_allclose(image.noise.total, sky / 10)
+    assert np.array_equal(image.mask, flags > 0)
+    assert image.wcs.naxis == 2
+    fits.writeto(tmp_path / 'b.fits', sky, header(**tan))
+    fits.writeto(tmp_path / 'b_mask.fits', flags[None])
+    assert np.array_equal(read_image(tmp_path / 'b.fits').mask, flags > 0)
+
+
+@pytest.mark.parametrize('ending', ['.gz', '.bz2', '.xz'])
+def test_companions_of_compressed_images_are_found(tmp_path, sky, ending):
+    fits.writeto(tmp_path / f'a.fits{ending}', sky)
+    fits.writeto(tmp_path / f'a_mask.fits{ending}', (sky > 120).astype('u1'))
+    image = read_image(tmp_path / f'a.fits{ending}')
+    assert np.array_equal(image.mask, sky > 120)
 
 
 @pytest.mark.parametrize(('text', 'unit'), [
@@ -312,7 +412,9 @@ def test_files_that_are_no_images_are_named(tmp_path, sky):
     with pytest.raises(FileNotFoundError, match='nothing'):
         read_image(tmp_path / 'nothing.fits')
     fits.PrimaryHDU(np.zeros((2, 3, 4))).writeto(tmp_path / 'cube.fits')
-    with pytest.raises(ValueError, match=r'cube\.fits.*2 dimensions'):
+    with pytest.raises(ValueError, match=(
+            r'cube\.fits: must hold an image of 2 dimensions, got '
+            r'one of 4 x 3 x 2 pixels')):
         read_image(tmp_path / 'cube.fits')
     fits.PrimaryHDU(sky).writeto(tmp_path / 'whole.fits')
     damaged = (tmp_path / 'whole.fits').read_bytes()[:9000]
