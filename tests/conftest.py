@@ -1,5 +1,6 @@
 """Fixtures shared by all tests: real data that may be absent, and seeds."""
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -44,6 +45,16 @@ def realdata():
             pytest.skip(reason=f'real data folder {name} is not here')
         return path
     return folder
+
+
+@pytest.fixture
+def interruptible():
+    """Let Ctrl-C interrupt, also where tests run in the background."""
+    # A shell starts background jobs with the signal ignored, and they hand
+    # that on to what they start.
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, handler)
 
 
 @pytest.fixture

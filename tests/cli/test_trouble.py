@@ -377,6 +377,7 @@ def wait_for(path, words, run):
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures('interruptible')
 @pytest.mark.parametrize(('signal_sent', 'code', 'said'), [
     (signal.SIGINT, 130, 'interrupted'),
     (signal.SIGTERM, 143, 'terminated')])

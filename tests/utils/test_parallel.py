@@ -110,6 +110,7 @@ def test_slices_are_no_longer_than_the_longest_allowed():
     assert len(lengths) == 1000
 
 
+@pytest.mark.usefixtures('interruptible')
 @pytest.mark.parametrize('n', [1, 3])
 def test_an_interrupt_waits_for_no_piece(n, monkeypatch):
     monkeypatch.setattr(parallel, 'available_cores', lambda: 2)
