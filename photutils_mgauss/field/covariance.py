@@ -24,13 +24,24 @@ and is drawn from a Gaussian of covariance
 where :math:`\tau^2 U_s` is what the deviations of the others do to the field
 at star s. The most likely :math:`\tau^2` is taken.
 
-Several exposures may show a star at one place. These detections share its
-deviation: s is then the place, with the sums of their equations.
+Several exposures may show a star at one place: s is then the place. Its n
+detections count as one, so that :math:`A_s` and :math:`b_s` are the means of
+their equations, but the noise in them is that of all, :math:`A_s / n`. They
+share what is wrong there, as the light of faint neighbours: noise that does
+not become less with n and is spread over pixels, :math:`\psi A_s`. With
+repeated places the gradient is drawn from a Gaussian of covariance
+
+.. math::
+
+    A_s (1 / n + \psi) + A_s \left(W_s + \tau^2 S + \tau^2 U_s\right) A_s ,
+
+where :math:`W_s` is what such noise of the others does to the field at s. The
+most likely :math:`\psi` and :math:`\tau^2` are taken.
 """
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 
 from photutils_mgauss.field.base import covariance_of
 from photutils_mgauss.field.normal import Workers, equations, to_vector
@@ -45,6 +56,9 @@ _FEWEST_STARS = 3
 # more likely, in 2 log(likelihood).
 _RANGE = (1e-5, 1e3)
 _GAIN = 1.0
+# Where psi and tau^2 are looked for together from, and how closely.
+_FIRST_SHARES = (0.3, 1e-3)
+_SHARE_TOLERANCES = {'xatol': 0.1, 'fatol': 0.1}
 # How many directions the errors at a place have. Positions and fluxes of
 # bright and of faint stars, in small and in large stamps, need no more.
 _DIRECTIONS = 6
@@ -66,7 +80,8 @@ def honest_covariance(fit):
     Returns
     -------
     covariance : (N, N) `~numpy.ndarray`
-        What the stars' deviations from the polynomials add is included.
+        What the stars' deviations from the polynomials add is included, and
+        what is wrong with all detections of a place.
     unmodelled : (P,) `~numpy.ndarray`
         The variances of the P shapes about their polynomials.
     """
@@ -77,23 +92,43 @@ def honest_covariance(fit):
         return covariance, np.zeros(scale.size)
     some = np.linspace(0, len(used) - 1, min(len(used),
                                              _MOST_STARS)).astype(int)
-    stars = _left_out(fit, covariance, [used[i] for i in some])
+    noise = _noise_of_detections(fit)
+    stars = _left_out(fit, covariance, [used[i] for i in some], noise)
     spread = sum(np.kron((star.matrix * scale) @ star.matrix,
                          np.outer(star.basis, star.basis)) for star in stars)
     spread *= len(used) / some.size
-    share = _most_likely([star.whitened(scale, spread) for star in stars])
-    added = covariance @ spread @ covariance
+    stars = [star.whitened(scale, spread) for star in stars]
+    if noise is None:
+        share = _most_likely(stars)
+    else:
+        common, share = _both_most_likely(stars)
+        covariance = covariance @ (
+            noise + common * fit.equations.matrix) @ covariance
+    added = covariance_of(fit) @ spread @ covariance_of(fit)
     return covariance + share * added, share * scale
 
 
-def with_all_detections(fit):
-    """Return the fit with the equations of all detections of a place."""
-    if fit.problem.n_places == len(fit.problem.place):
-        return fit
-    problem = replace(fit.problem, places_once=False)
+def plain_covariance(fit):
+    """Return the covariance of the coefficients that noise alone makes."""
+    covariance, noise = covariance_of(fit), _noise_of_detections(fit)
+    return covariance if noise is None else covariance @ noise @ covariance
+
+
+def _noise_of_detections(fit):
+    """
+    Return the covariance (N, N) of the gradient, the prior's included.
+
+    None if all detections count fully: it is the matrix of the equations.
+    """
+    problem = fit.problem
+    shares = problem.shares()
+    if (shares[problem.used] == 1).all():
+        return None
+    # That a detection counts less does not make it noisier.
+    twice = replace(problem, weights=problem.weights * shares[:, None, None])
     with Workers() as workers:
-        return replace(fit, problem=problem, equations=equations(
-            problem, fit.coefficients, workers))
+        found = equations(twice, fit.coefficients, workers)
+    return found.matrix + np.diag(to_vector(fit.prior.precision))
 
 
 def _by_place(problem):
@@ -125,55 +160,80 @@ class _LeftOut:
     basis : (T,) `~numpy.ndarray`
     to_others : (N, P) `~numpy.ndarray`
         The covariance of the coefficients and the shapes at the star.
-    prediction : (P, P) `~numpy.ndarray`
-        The covariance of the shapes that the others predict.
+    noise : float
+        The noise of the gradient, in units of the matrix.
+    prediction, common : (P, P) `~numpy.ndarray`
+        The covariance of the shapes that the others predict, and what is
+        added to it if each has noise that its detections share.
     """
 
     matrix: np.ndarray
     gradient: np.ndarray
     basis: np.ndarray
     to_others: np.ndarray
+    noise: float
     prediction: np.ndarray
+    common: np.ndarray
 
     def whitened(self, scale, spread):
         """
-        Return gradient, expected excess of it, and that for tau^2 = 1.
+        Return gradient, covariance of it, what psi = 1 and tau^2 = 1 add.
 
-        In units in which the star's own noise is a unit matrix.
+        In units in which the matrix is a unit matrix.
         """
         values, vectors = np.linalg.eigh(self.matrix)
         seen = values > 1e-10 * values.max()
         root = np.sqrt(values[seen])
         vectors = vectors[:, seen]
-        own = np.einsum('ptq,t->pq', self.to_others.reshape(
-            scale.size, -1, scale.size), self.basis) @ self.matrix
+        own = _at(self.to_others, self.basis) @ self.matrix
         others = (self.to_others.T @ spread @ self.to_others
                   - own * scale @ own.T)
         unmodelled = others + np.diag(scale)
+        prediction, common, unmodelled = (
+            root[:, None] * (vectors.T @ one @ vectors) * root
+            for one in (self.prediction, self.common, unmodelled))
+        unit = np.eye(root.size)
         return (vectors.T @ self.gradient / root,
-                *(root[:, None] * (vectors.T @ one @ vectors) * root
-                  for one in (self.prediction, unmodelled)))
+                self.noise * unit + prediction, unit + common, unmodelled)
 
 
-def _left_out(fit, covariance, stars):
-    """Return the stars as they look to the fit to all others."""
+def _at(coefficients, basis):
+    """Return the shapes (P, Q) at a place for coefficients (P T, Q)."""
+    return np.einsum('ptq,t->pq', coefficients.reshape(
+        -1, basis.size, coefficients.shape[1]), basis)
+
+
+def _left_out(fit, covariance, stars, noise):
+    """
+    Return the stars as they look to the fit to all others.
+
+    ``noise`` is the covariance of the gradient where it is not the matrix of
+    the equations, else None.
+    """
     found = []
     with Workers() as workers:
         for star in stars:
             # The detections of one place differ little in theirs.
             basis = fit.problem.basis[star].mean(axis=0)
-            matrix, gradient = map(sum, zip(*(_own_equations(
-                fit, one, workers) for one in star), strict=True))
+            matrix, gradient = (sum(one) / len(star) for one in zip(*(
+                _own_equations(fit, one, workers) for one in star),
+                strict=True))
             size = len(matrix)
             # M^-1 B, and without this star by Woodbury's identity.
             towards = covariance.reshape(-1, size, basis.size) @ basis
-            here = np.einsum('ptq,t->pq', towards.reshape(
-                size, basis.size, size), basis)
+            here = _at(towards, basis)
             without = np.linalg.inv(np.eye(size) - matrix @ here)
             prediction = here @ without
+            towards = towards @ without
+            gradient = gradient + matrix @ (prediction @ gradient)
+            common = np.zeros_like(prediction)
+            if noise is not None:
+                own = prediction.T @ matrix @ prediction
+                common = towards.T @ fit.equations.matrix @ towards - own
+                prediction = towards.T @ noise @ towards - own / len(star)
             found.append(_LeftOut(
-                matrix, gradient + matrix @ (prediction @ gradient), basis,
-                towards @ without, (prediction + prediction.T) / 2))
+                matrix, gradient, basis, towards, 1 / len(star),
+                (prediction + prediction.T) / 2, (common + common.T) / 2))
     return found
 
 
@@ -189,19 +249,34 @@ def _own_equations(fit, star, workers):
 def _most_likely(stars):
     """Return the tau^2 under which the left-out stars are most likely."""
     def cost(share):
-        total = 0
-        for gradient, expected, unmodelled in stars:
-            values, vectors = np.linalg.eigh(
-                np.eye(gradient.size) + expected + share * unmodelled)
-            values = np.maximum(values, 1e-3)
-            total += np.sum(np.log(values)
-                            + (vectors.T @ gradient) ** 2 / values)
-        return total
+        return _cost(stars, 0.0, share)
 
     best = minimize_scalar(lambda log: cost(np.exp(log)),
                            bounds=np.log(_RANGE), method='bounded',
                            options={'xatol': 0.1})
     return np.exp(best.x) if cost(0.0) - best.fun > _GAIN else 0.0
+
+
+def _both_most_likely(stars):
+    """Return psi and tau^2 under which left-out places are most likely."""
+    best = minimize(lambda logs: _cost(stars, *np.exp(logs)),
+                    np.log(_FIRST_SHARES), method='Nelder-Mead',
+                    bounds=np.log([_RANGE, _RANGE]),
+                    options=_SHARE_TOLERANCES)
+    common, share = np.exp(best.x)
+    needed = _cost(stars, common, 0.0) - best.fun > _GAIN
+    return common, share if needed else 0.0
+
+
+def _cost(stars, common, share):
+    """Return -2 log(likelihood) of psi and tau^2, up to a constant."""
+    total = 0
+    for gradient, expected, by_common, unmodelled in stars:
+        values, vectors = np.linalg.eigh(
+            expected + common * by_common + share * unmodelled)
+        values = np.maximum(values, 1e-3)
+        total += np.sum(np.log(values) + (vectors.T @ gradient) ** 2 / values)
+    return total
 
 
 def shape_covariance(covariance, unmodelled, basis):

@@ -16,7 +16,6 @@ from astropy.utils.exceptions import AstropyUserWarning
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import (
     core_width,
-    covariance_of,
     residual_stars,
     star_table,
 )
@@ -30,7 +29,7 @@ from photutils_mgauss.field.choice import (
 from photutils_mgauss.field.contexts import lateral_shifts
 from photutils_mgauss.field.covariance import (
     honest_covariance,
-    with_all_detections,
+    plain_covariance,
 )
 from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.growth import (
@@ -403,11 +402,10 @@ def _tuned(fit, sample, start, radius, centre):
 
 def _errors(fit, sample):
     """Return the covariance of coefficients, and what is not modelled."""
-    fit = with_all_detections(fit)
     covariance, unmodelled = honest_covariance(fit)
     if fit.lack or any(sample.correlations):
         covariance = covariance + (noise_covariance(
-            fit, sample.correlations, sample.growth) - covariance_of(fit))
+            fit, sample.correlations, sample.growth) - plain_covariance(fit))
     return covariance, unmodelled
 
 

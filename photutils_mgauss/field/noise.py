@@ -52,7 +52,7 @@ def noise_covariance(fit, correlations=None, growth=None):
     n = problem.exposure.max() + 1
     correlations = [None] * n if correlations is None else correlations
     growth = np.ones(n) if growth is None else growth
-    slopes = _Slopes(fit)
+    slopes, shares = _Slopes(fit), problem.shares()
     total = np.diag(to_vector(fit.prior.precision))
     for star in np.flatnonzero(problem.used):
         exposure = problem.exposure[star]
@@ -60,8 +60,8 @@ def noise_covariance(fit, correlations=None, growth=None):
         gradient = _gradient_covariance(
             free, inside, noise[star] / growth[exposure], misfit[star],
             correlations[exposure])
-        total += np.kron(gradient, np.outer(problem.basis[star],
-                                            problem.basis[star]))
+        total += np.kron(shares[star] ** 2 * gradient, np.outer(
+            problem.basis[star], problem.basis[star]))
     covariance = covariance_of(fit)
     return covariance @ total @ covariance
 
