@@ -16,6 +16,18 @@ _QUANTITIES = {
     'stddevs': ('x_stddev_', 'y_stddev_'), 'rho': ('rho_',),
     'flux': ('flux',), 'sigma': ('sigma',)}
 
+# A figure of many parameters is legible when a column of a journal is so wide
+# [inch] and its letters are so large [pt].
+_COLUMN, _LETTERS = 3.3, 6.0
+# Of the figure of a corner plot, and of a panel of it [inch].
+_LEAST, _PANEL = 4.0, 1.3
+_TEXTS = 'font.size', 'axes.labelsize', 'xtick.labelsize', 'ytick.labelsize'
+# With more parameters than these, names are longer than a panel is wide.
+_WIDE = 2
+# Of more than these, a figure is for a page: in a column the names of so many
+# would leave no room.
+_MANY = 8
+
 
 def plot_posterior(posterior, name, *, ax=None):
     """
@@ -126,7 +138,8 @@ def plot_corner(posterior, names=None, *, axes=None):
         Parameters or quantities as in `plot_posterior`; None is all
         parameters that vary.
     axes : (n, n) array_like of `~matplotlib.axes.Axes`, optional
-        Where to draw n parameters; None makes a figure for them.
+        Where to draw n parameters; None makes a figure for them. That of up
+        to eight parameters is legible in a column of a journal.
 
     Returns
     -------
@@ -173,22 +186,38 @@ def plot_corner(posterior, names=None, *, axes=None):
                 ax.set(yticks=[])
             else:
                 ax.plot(x, y, ',', color=BLUE, alpha=0.4, rasterized=True)
-            ax.locator_params(nbins=3)
+            ax.locator_params(nbins=2 if len(draws) > _WIDE else 3)
             ax.label_outer()
             if i == len(draws) - 1:
                 ax.set_xlabel(_with_unit(x_name))
             if j == 0 < i:
                 ax.set_ylabel(_with_unit(y_name))
+    if len(draws) > _WIDE:
+        _slant(axes)
     return axes
+
+
+def _slant(axes):
+    """Turn names and numbers that are longer than a panel is wide."""
+    for ax in axes[-1]:
+        ax.xaxis.label.set(rotation=45, ha='right', va='top',
+                           rotation_mode='anchor')
+        ax.tick_params('x', rotation=90)
+    for ax in axes[1:, 0]:
+        ax.yaxis.label.set(rotation=0, ha='right', va='center')
 
 
 def _square_of_axes(axes, n):
     """Return (n, n) Axes, those given or new ones."""
     if axes is None:
         import matplotlib.pyplot as plt
-        size = max(4, 1.3 * n)
-        axes = plt.subplots(n, n, figsize=(size, size), squeeze=False,
-                            sharex='col', layout='constrained')[1]
+        size = max(_LEAST, _PANEL * n)
+        # The same size in print, in a column, whatever the number of panels.
+        letters = _LETTERS * _PANEL * min(n, _MANY) / _COLUMN
+        letters = max(letters, _LETTERS * _LEAST / _COLUMN)
+        with plt.rc_context(dict.fromkeys(_TEXTS, letters)):
+            axes = plt.subplots(n, n, figsize=(size, size), squeeze=False,
+                                sharex='col', layout='constrained')[1]
     axes = np.atleast_2d(axes)
     if axes.shape != (n, n):
         msg = (f'axes must have the shape ({n}, {n}), one row for each '

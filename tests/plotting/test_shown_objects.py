@@ -1,5 +1,6 @@
 """What objects draw of themselves, and how notebooks show them."""
 import inspect
+from itertools import pairwise
 
 import matplotlib as mpl
 import numpy as np
@@ -119,6 +120,41 @@ def test_a_corner_plot_has_a_row_for_each_parameter_that_varies():
     assert_allclose(y, posterior.stddevs[..., 0, 1].ravel())
     with pytest.raises(ValueError, match=r'axes must have the shape \(1, 1\)'):
         posterior.plot(['flux'], axes=axes)
+
+
+def numbers_of(axis):
+    """Return the numbers at an axis that are within its limits."""
+    low, high = sorted(axis.get_view_interval())
+    return [tick.label1 for tick in axis.get_major_ticks()
+            if tick.label1.get_visible() and low <= tick.get_loc() <= high]
+
+
+@pytest.mark.parametrize('n', [2, 3, 7])
+def test_a_corner_plot_is_legible_in_a_column(n, pyplot):
+    names = ['x_mean_1', 'y_mean_1', 'x_stddev_1', 'y_stddev_1', 'rho_1',
+             'flux', 'sigma'][:n]
+    axes = make_posterior().plot(names)
+    figure = axes[0, 0].figure
+    figure.draw_without_rendering()
+    column = 3.3 / figure.get_figwidth()
+    shown = [text for ax in axes[np.tril_indices(n)]
+             for axis in (ax.xaxis, ax.yaxis)
+             for text in (axis.label, *numbers_of(axis))
+             if text.get_text() and text.get_visible()]
+    assert len(shown) > 3 * n
+    assert min(text.get_fontsize() for text in shown) * column >= 5.5
+    inside = figure.bbox.padded(1)
+    for text in shown:
+        box = text.get_window_extent()
+        assert inside.contains(box.x0, box.y0)
+        assert inside.contains(box.x1, box.y1)
+    # Names do not lie on the numbers of their own axis or on each other.
+    for ax in axes[1:, 0]:
+        name = ax.yaxis.label.get_window_extent()
+        assert not any(name.overlaps(tick.get_window_extent())
+                       for tick in numbers_of(ax.yaxis))
+    heights = [ax.yaxis.label.get_window_extent() for ax in axes[1:, 0]]
+    assert all(low.y1 < high.y0 for high, low in pairwise(heights))
 
 
 def test_without_matplotlib_a_notebook_shows_the_text(monkeypatch):
