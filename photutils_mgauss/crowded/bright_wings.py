@@ -5,7 +5,6 @@ What the PSF lacks in the wings of a saturated star would be taken for faint
 stars, and these take light from which the star's place and flux are known.
 """
 import numpy as np
-from astropy.stats import mad_std
 from scipy.ndimage import distance_transform_edt
 
 from photutils_mgauss.crowded.table import BLEND_CORRELATION
@@ -25,6 +24,8 @@ _TELLING = 0.1
 DOUBTFUL = 0.01
 # Their light elsewhere is measured on so many of the pixels, or on all.
 _ENOUGH = 0.05
+# Pixels further off than so many standard errors hold stars to be found.
+_CLIP, _PASSES = 4.0, 3
 
 
 def left_of_bright(tile):
@@ -51,20 +52,33 @@ def left_of_bright(tile):
         return None, ~own
     stars = np.stack([s.x, s.y, s.flux])
     reach = int(s.core[s.seeded].max()) + WINGS
+    beside = pixels_beside(stars[:, telling | s.seeded], tile.least.shape,
+                           reach)
     left = _with_faint(
         tile.model, own & (s.flux < DOUBTFUL * np.median(s.flux[telling])),
-        pixels_beside(stars[:, telling | s.seeded], tile.least.shape, reach))
+        beside)
     weight = tile.model.weight
-    # Stars that are not found yet are noise, too.
-    variance = np.maximum(np.divide(1, weight, where=weight > 0, out=np.full(
-        weight.shape, -np.inf)), mad_std(left[weight > 0])**2)
-    variance[weight == 0] = 0
+    variance = np.divide(1, weight, where=weight > 0,
+                         out=np.zeros(weight.shape))
+    elsewhere = pixels_elsewhere(weight > 0, beside)
+    variance[weight > 0] += _beyond_noise(left[elsewhere],
+                                          variance[elsewhere])
     known = PSFResidual.of(
         left, without_surroundings(variance, stars[:, s.seeded], reach),
         stars[:, telling], reach)
     if known is None:
         return None, ~own
-    return known, own & doubtful(stars, np.flatnonzero(s.seeded), known.reach)
+    return known.cautious(), own & doubtful(
+        stars, np.flatnonzero(s.seeded), known.reach)
+
+
+def _beyond_noise(left, variance):
+    """Return the variance that stars not found yet add to noise (m,)."""
+    more = 0.0
+    for _ in range(_PASSES):
+        good = left**2 < _CLIP**2 * (variance + more)
+        more = max((left**2 - variance)[good].mean(), 0.0)
+    return more
 
 
 def _telling(tile):

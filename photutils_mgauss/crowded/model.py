@@ -63,6 +63,7 @@ class Model:
     def __init__(self, job):
         self.data = job.data
         self.variance = job.variance
+        self.wing_variance = None
         self.good = job.variance > 0
         self.psf = job.psf
         self.options = job.options
@@ -199,10 +200,14 @@ class Model:
         """Add the light of chosen stars to an image, in place."""
         self._add_stars(chosen, 1.0, image)
 
-    def take_off(self, image):
-        """Take light that is no star's off the data."""
+    def take_off(self, image, variance):
+        """Take light that is no star's, known to a variance, off the data."""
         self.data = self.data - image
         self.residual -= image
+        self.variance = np.where(self.good, self.variance + variance,
+                                 self.variance)
+        self.wing_variance = variance
+        np.divide(1, self.variance, where=self.good, out=self.weight)
         self._weigh()
 
     def background(self):

@@ -3,6 +3,7 @@ import numpy as np
 from astropy.table import QTable
 
 from photutils_mgauss import kernels
+from photutils_mgauss.crowded.bright_errors import with_wing_errors
 from photutils_mgauss.crowded.confusion import Confusion
 from photutils_mgauss.crowded.judge import smooth_light
 from photutils_mgauss.crowded.stars import Stars
@@ -63,7 +64,8 @@ def tabulate(tile, core):
     quality = quality_of(model)
     covariance, correlation = tile.equations.covariances()
     hidden = _hidden(tile, covariance)
-    covariance = covariance * misfit(quality)[:, None, None]
+    covariance = with_wing_errors(
+        model, covariance * misfit(quality)[:, None, None])
     with np.errstate(invalid='ignore'):
         error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     count, chi2, deviation, centre, crowding, _ = quality.T

@@ -248,8 +248,10 @@ class Tile(Searched):
             return
         self.model.dismiss(gone)
         s = self.stars
-        self.model.take_off(known.image(*(
-            column[s.seeded] for column in (s.x, s.y, s.flux))))
+        light, variance = np.zeros((2, *self.least.shape))
+        known.take_off(light, variance, np.stack(
+            [s.x, s.y, s.flux])[:, s.seeded], known.reach)
+        self.model.take_off(-light, variance)
         self._form_equations()
 
     def note_least(self, measure):

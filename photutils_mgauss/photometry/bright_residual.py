@@ -176,7 +176,7 @@ def doubtful(stars, bright, radius):
 def _cleaned(image, known, stars, radius):
     """Return an image without what the PSF leaves of some stars."""
     data, more = image.data.copy(), np.zeros(image.data.shape)
-    known.take_off(data, more, stars, whole_reach(radius))
+    known.cautious().take_off(data, more, stars, whole_reach(radius))
     if not image.error.size:
         return image._replace(data=data)
     return image._replace(data=data, error=np.sqrt(image.error**2 + more))

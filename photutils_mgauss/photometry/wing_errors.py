@@ -37,7 +37,7 @@ _SINGULAR = 1e14
 
 
 @dataclass(frozen=True, eq=False)
-class _Wings:
+class Wings:
     """
     The pixels of a saturated star that were fitted.
 
@@ -73,17 +73,25 @@ class _Wings:
         if image.mask.size:
             seen &= ~image.mask[row, column]
         light[1:] *= flux
-        design = light[free][:, seen]
-        weighed = design / variance[seen]
-        matrix = weighed @ design.T
-        if not (spread[seen] > 0).any() or not (
-                np.linalg.cond(matrix) < _SINGULAR):
+        return cls.of_pixels(row[seen], column[seen], light[:, seen],
+                             variance[seen], spread[seen], free)
+
+    @classmethod
+    def of_pixels(cls, row, column, design, variance, spread, free):
+        """
+        Return wings of pixels (m,) with a design (3, m).
+
+        ``variance`` is all of theirs, ``free`` (3,) what was fitted of flux,
+        x and y. None if the stars do not differ, or the fit has no errors.
+        """
+        weighed = design[free] / variance
+        matrix = weighed @ design[free].T
+        if not (spread > 0).any() or not np.linalg.cond(matrix) < _SINGULAR:
             return None
-        shifts = np.zeros((3, np.count_nonzero(seen)))
+        shifts = np.zeros(design.shape)
         shifts[free] = np.linalg.solve(matrix, weighed)
         noise = np.sqrt(np.maximum(variance - spread**2, 0))
-        return cls(row[seen], column[seen], light[:, seen], shifts,
-                   spread[seen], noise[seen])
+        return cls(row, column, design, shifts, spread, noise)
 
     @cached_property
     def pairs(self):
@@ -177,19 +185,28 @@ def wing_errors(result, image, cleaned, model, known):
         boxes = cut_boxes(*result.initial[rows, 1:].T, result.shapes[rows],
                           image.data.shape)
         psf = psf_arrays(model)
-        every = {row: _Wings.of(result.values[row], box, result.free,
+        every = {row: Wings.of(result.values[row], box, result.free,
                                 (image, cleaned), psf)
                  for row, box in zip(rows, boxes, strict=True)}
         every = {row: one for row, one in every.items() if one is not None}
     if not every:
         return rows[:0], *np.empty((2, 0, 3, 3))
-    correlation = _correlation(list(every.values())[:_MOST],
-                               left_of_saturated(result, image, model, known))
+    return np.array(list(every)), *covariances_of(
+        list(every.values()), left_of_saturated(result, image, model, known))
+
+
+def covariances_of(every, left):
+    """
+    Return covariances (2, m, 3, 3) that wings make of flux, x and y.
+
+    As what is left of the image (ny, nx) says, and with each pixel off for
+    itself.
+    """
+    correlation = _correlation(every[:_MOST], left)
     alone = np.zeros(correlation.shape)
     alone[_REACH, _REACH] = 1
-    return np.array(list(every)), *(np.array([
-        one.covariance(matrix) for one in every.values()])
-        for matrix in (correlation, alone))
+    return np.array([[one.covariance(matrix) for one in every]
+                     for matrix in (correlation, alone)])
 
 
 def _correlation(every, left):

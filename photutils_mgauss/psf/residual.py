@@ -20,7 +20,7 @@ fluxes: divided by these it is not the same for all.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import correlate1d, gaussian_filter, map_coordinates
 
 # Samples for each pixel, and the Gaussian, in samples, that smooths them: a
 # PSF that is two pixels wide leaves nothing finer.
@@ -35,7 +35,11 @@ def _remaining_variance():
     one[20, 20] = 1
     out = gaussian_filter(one, _SMOOTH)
     for _ in range(_SHARPER):
-        out += gaussian_filter(one - out, _SMOOTH)
+        seen = out
+        # Pixels are anywhere in the cells between which samples are read.
+        for axis in (0, 1):
+            seen = correlate1d(seen, [0.125, 0.75, 0.125], axis)
+        out = out + gaussian_filter(one - seen, _SMOOTH)
     return (out**2).sum()
 
 
@@ -69,12 +73,15 @@ class PSFResidual:
         The pixels of the image.
     sky : float
         The level of the sky that was left around the stars.
+    unseen : (m,) `~numpy.ndarray` or 0
+        What else may be left, at each distance, without standing out of noise.
     """
 
     terms: np.ndarray
     spread: np.ndarray
     shape: tuple
     sky: float = 0.0
+    unseen: np.ndarray | float = 0.0
 
     @classmethod
     def of(cls, residual, variance, stars, radius, bright=None):
@@ -117,8 +124,8 @@ class PSFResidual:
             left = here.value - here.read(terms)
             good = np.abs(left) < _CLIP * np.sqrt(here.variance + more)
             spread = here.spread(left, good)
-        return cls(_faded(terms, radius), np.sqrt(spread**2 + unknown),
-                   residual.shape, sky)
+        return cls(_faded(terms, radius), np.sqrt(spread**2 + unknown[0]),
+                   residual.shape, sky, np.sqrt(unknown[1]))
 
     def stamp(self, x, y, half):
         """
@@ -153,6 +160,10 @@ class PSFResidual:
         self.take_off(out, np.zeros(self.shape),
                       stars[:, np.isfinite(stars).all(axis=0)], self.reach)
         return -out
+
+    def cautious(self):
+        """Return the same with a spread that has what may be unseen, too."""
+        return replace(self, spread=np.hypot(self.spread, self.unseen))
 
     @property
     def reach(self):
@@ -250,7 +261,8 @@ class _Samples:
         """
         Return the terms (k, w, w), as far as they stand out of noise.
 
-        And the variances that they have left at each distance.
+        And the variances (2, m) that they have left at each distance, where
+        they do and where they do not.
         """
         inverse = self._inverse(weight)
         terms = self._fitted(weight, self.value, inverse)
@@ -300,16 +312,22 @@ class _Samples:
 
 
 def _shrunk(term, noise):
-    """Return a term where it is more than noise, and variances (m,) left."""
+    """
+    Return a term where it is more than noise, and variances (2, m) left.
+
+    Where it is, and where it is not and may still be there.
+    """
     y, x = (np.indices(term.shape) - term.shape[0] // 2) / _FINE
     ring = _ring(x, y)
     total, noise = (np.bincount(ring.ravel(), values.ravel())
                     for values in (term**2, noise))
     count = np.bincount(ring.ravel())
     least = noise * (1 + _SIGNIFICANT * np.sqrt(2 / _SMOOTHED / count))
-    share = np.divide(total - noise, total, where=total > least,
+    more = np.maximum(total - noise, 0)
+    share = np.divide(more, total, where=total > least,
                       out=np.zeros(total.size))
-    return term * share[ring], share * noise / count
+    return term * share[ring], np.stack([
+        share * noise, np.where(share > 0, 0, more)]) / count
 
 
 def whole_reach(radius):

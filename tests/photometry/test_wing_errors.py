@@ -3,7 +3,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter
 
-from photutils_mgauss.photometry.wing_errors import _correlation, _Wings
+from photutils_mgauss.photometry.wing_errors import Wings, _correlation
 
 SIDE, SPREAD, NOISE, SCALE = 17, 3.0, 4.0, 0.8
 
@@ -19,7 +19,7 @@ def wings(place):
     noise = np.full(seen.sum(), NOISE)
     weighed = design / (spread**2 + noise**2)
     shifts = np.linalg.solve(weighed @ design.T, weighed)
-    return _Wings(row[seen] + place, column[seen], design, shifts, spread,
+    return Wings(row[seen] + place, column[seen], design, shifts, spread,
                   noise)
 
 

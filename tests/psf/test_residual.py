@@ -95,3 +95,21 @@ def test_it_fades_beyond_the_radius():
     assert not seen[away > 1.3 * HALF].any()
     inside = found.stamp(200.2, 200.4, HALF)[0]
     np.testing.assert_allclose(seen[191:210, 191:210], 1e5 * inside)
+
+
+def test_what_does_not_stand_out_of_noise_may_still_be_there():
+    y, x = np.indices((41, 41)) - 20
+    ring = np.hypot(x, y).astype(int).ravel()
+    true = np.bincount(ring, left_over(x, y, 0).ravel()**2) / np.bincount(ring)
+    unseen = []
+    for amplitude in (0, 0.02):
+        found = [PSFResidual.of(*scene(40, seed, amplitude), HALF)
+                 for seed in range(4)]
+        # Hardly any of it is seen.
+        assert np.mean([np.mean(one.spread == 0) for one in found]) > 0.8
+        unseen.append(np.mean([one.unseen[2:8]**2 + one.spread[2:8]**2
+                               for one in found]))
+    assert unseen[0] < unseen[1] / 2
+    assert unseen[1] == pytest.approx(0.02**2 * true[2:8].mean(), rel=0.3)
+    assert found[0].cautious().spread[9] == pytest.approx(
+        np.hypot(found[0].spread[9], found[0].unseen[9]))
