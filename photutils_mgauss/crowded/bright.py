@@ -9,7 +9,7 @@ from photutils_mgauss.psf.wings import WINGS, place_behind
 _SATURATED_PIXELS = (2, 2000)
 # Within this distance of what a saturated star hides [pix], whatever is
 # fainter than this part of it is what the PSF leaves of it.
-_BESIDE, _DOUBTFUL = 2.3, 0.01
+BESIDE, DOUBTFUL = 2.3, 0.01
 
 
 def saturated_stars(model):
@@ -75,8 +75,8 @@ def least_fluxes(model):
         return np.zeros(model.data.shape)
     distance, nearest = distance_transform_edt(flux[clumps] == 0,
                                                return_indices=True)
-    return np.where(distance <= _BESIDE,
-                    _DOUBTFUL * flux[clumps[tuple(nearest)]], 0)
+    return np.where(distance <= BESIDE,
+                    DOUBTFUL * flux[clumps[tuple(nearest)]], 0)
 
 
 def size_differences(model):

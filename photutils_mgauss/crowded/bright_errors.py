@@ -34,6 +34,19 @@ def with_wing_errors(model, covariances):
 
 def _wings(model, star):
     """Return the Wings of a star, None if nothing is known of its errors."""
+    row, column, design, variance, _ = pixels_of(model, star)
+    return Wings.of_pixels(
+        row, column, design, variance,
+        np.sqrt(model.wing_variance[row, column]), np.ones(3, bool))
+
+
+def pixels_of(model, star):
+    """
+    Return the good pixels (m,) in the stamp of a star.
+
+    Their rows and columns, the derivatives (3, m) by flux, x and y, their
+    variances, and half the width of the stamp.
+    """
     stamps = model.stamps
     width = stamps.width[star]
     y, x = np.indices((width, width)).reshape(2, -1)
@@ -46,6 +59,4 @@ def _wings(model, star):
     design = model.stamps.derivatives[
         :, stamps.offset[star] + np.flatnonzero(seen)]
     design[1:] *= model.stars.flux[star]
-    return Wings.of_pixels(
-        row, column, design, 1 / model.weight[row, column],
-        np.sqrt(model.wing_variance[row, column]), np.ones(3, bool))
+    return row, column, design, 1 / model.weight[row, column], int(width) // 2

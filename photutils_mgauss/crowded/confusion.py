@@ -420,6 +420,16 @@ def _laws(moves, rate, numbers):
     return np.cumsum(np.roll(chance, _ZERO, axis=1), axis=1)
 
 
+def square_of_one(moves, rate):
+    """
+    Return what hidden stars do to one number of a star.
+
+    By what the square of the width of its errors about 0 exceeds 1, of moves
+    and rates as `_laws` has them.
+    """
+    return _squares(_laws(moves, rate, np.ones(1)), [0.0])[0]
+
+
 def _quantile(law, share):
     """Return below which error a share of the law is."""
     # Half of what is in a bin is below its middle.

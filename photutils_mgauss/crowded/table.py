@@ -4,6 +4,7 @@ from astropy.table import QTable
 
 from photutils_mgauss import kernels
 from photutils_mgauss.crowded.bright_errors import with_wing_errors
+from photutils_mgauss.crowded.companions import with_companions
 from photutils_mgauss.crowded.confusion import Confusion
 from photutils_mgauss.crowded.judge import smooth_light
 from photutils_mgauss.crowded.stars import Stars
@@ -66,6 +67,8 @@ def tabulate(tile, core):
     hidden = _hidden(tile, covariance)
     covariance = with_wing_errors(
         model, covariance * misfit(quality)[:, None, None])
+    if tile.options.confusion and tile.options.find_neighbors:
+        hidden = with_companions(hidden, model, covariance)
     with np.errstate(invalid='ignore'):
         error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     count, chi2, deviation, centre, crowding, _ = quality.T
