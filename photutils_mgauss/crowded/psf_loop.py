@@ -49,6 +49,9 @@ _REST = 2e-3
 _LARGEST, _WINDOW, _WINDOWS = 1536, 320, 5
 # Where the PSF of two passes is compared, and how far from its centre [pix].
 _PLACES, _REACH = (3, 3), 8
+# Of Gaussians that miss so much of the light in bright pixels it is asked
+# whether more would miss less, by as much.
+_POOR = 0.005
 # Stars are drawn out to where this fraction of the noise is left of them.
 _FAINTEST = 1e-3
 
@@ -243,6 +246,7 @@ def fit_field(pixels, options, solve, effective_gain=None):
                                            len(field.stars))
             if steady and (change < _REST
                            or (steady > 2 and turns_back(*passes))):
+                _tell_of_few(field, passes[-2], solved, number, options)
                 break
         else:
             warnings.warn(
@@ -324,13 +328,34 @@ def next_field(image, field, number, options, solve):
                             max(field.accuracy, _LEAST_ERROR), rules)
     _check_number(stars, rules)
     used = stars[stars['selected']]
-    new = fit_mixture_field(
+    new = _fit(solved, psf, used, number, options)
+    return _with_reasons(new, stars), solved
+
+
+def _fit(solved, psf, used, number, options):
+    """Fit a field to some stars, all others taken off."""
+    return fit_mixture_field(
         solved.with_stars(psf, used), used, error=np.sqrt(solved.variance),
         n_components=options.n_components,
         degree=options.degree_of(number, len(used)),
         radius=options.radius(number), local_bkg=number < _OWN_SKY,
         effective_gain=np.inf, normalise='stamps', brighter_fatter=False)
-    return _with_reasons(new, stars), solved
+
+
+def _tell_of_few(field, before, solved, number, options):
+    """Warn if fewer Gaussians than usual miss light that more would have."""
+    n = options.n_components
+    if n >= LoopOptions.n_components or field.accuracy < _POOR:
+        return
+    used = field.stars['x_fit', 'y_fit', 'flux_fit'][field.stars['used']]
+    used.rename_columns(used.colnames, ['x', 'y', 'flux'])
+    more = _fit(solved, grid_of(before), used, number, replace(
+        options, n_components=LoopOptions.n_components, degree=field.degree))
+    if field.accuracy - more.accuracy > _POOR:
+        warnings.warn(
+            f'n_components={n} misses {field.accuracy:.1%} of the light in '
+            f'the pixels of bright stars: the default of {more.n_components} '
+            f'misses {more.accuracy:.1%}', AstropyUserWarning, stacklevel=5)
 
 
 def _with_reasons(field, stars):

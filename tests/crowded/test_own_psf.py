@@ -1,5 +1,7 @@
 """The PSF of a crowded image from its own stars."""
+import re
 import sys
+import warnings
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -251,6 +253,26 @@ def test_faint_stars_of_a_dense_field_are_no_wings_of_the_psf():
     for radius in (5, 8, 10):
         assert_allclose(found.mixture_at(50, 50).encircled_energy(radius),
                         psf.encircled_energy(radius), atol=0.01)
+
+
+@pytest.mark.parametrize('few', [True, False])
+def test_it_is_said_that_few_gaussians_miss_light(few):
+    n, rng = 80, np.random.default_rng(6)
+    psf = GaussianMixture.from_stddevs(
+        [0.7, 0.3], np.zeros((2, 2)), [(.95, .95), (2.2, 2.2)])
+    x, y = rng.uniform(0, n, (2, 60))
+    light = render_stars(GriddedMixturePSF([psf], [(40, 40)]), x, y,
+                         rng.uniform(1e4, 1e5, x.size), (n, n)) + 50
+    data, error = rng.normal(light, np.sqrt(light)), np.sqrt(light)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter('always')
+        fit_crowded_psf(data, error=error, n_components=1 if few else 2,
+                        degree=0, radius=8)
+    told = [str(one.message) for one in told if 'misses' in str(one.message)]
+    assert len(told) == few
+    if few:
+        assert re.search(r'n_components=1 misses \d+\.\d% of the light .* the '
+                         r'default of 6 misses 0\.\d%', told[0])
 
 
 @pytest.mark.parametrize(('places', 'n_passes'), [
