@@ -25,7 +25,11 @@ from photutils_mgauss.field.fit import fit_mixture_field
 from photutils_mgauss.field.input import normalised, read_sample
 from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.utils.equality import ComparedByValue
-from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
+from photutils_mgauss.utils.validation import (
+    as_grid_shape,
+    as_integer,
+    as_real,
+)
 from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['EmpiricalPSF']
@@ -214,7 +218,7 @@ class EmpiricalPSF(ComparedByValue):
         """
         from astropy.nddata import NDData
         from photutils.psf import GriddedPSFModel
-        grid = as_shape(grid_shape, 'grid_shape')
+        grid = as_grid_shape(grid_shape)
         fine = 2 * self.oversampling if oversampling is None else oversampling
         places = list(zip(*lattice(grid, self.field.shape), strict=True))
         images = [self.image_at(x, y, oversampling=fine) for x, y in places]

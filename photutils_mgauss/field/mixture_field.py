@@ -33,7 +33,11 @@ from photutils_mgauss.files.storage import storable, table_columns
 from photutils_mgauss.psf.contexts import PSFContext, known_contexts
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
-from photutils_mgauss.utils.validation import as_integer, as_real, as_shape
+from photutils_mgauss.utils.validation import (
+    as_grid_shape,
+    as_integer,
+    as_real,
+)
 from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['MixtureField']
@@ -520,7 +524,7 @@ class MixtureField(Field):
         TypeError, ValueError
             If an argument is not valid.
         """
-        nodes = list(lattice(as_shape(grid_shape, 'grid_shape'), self.shape))
+        nodes = list(lattice(as_grid_shape(grid_shape), self.shape))
         given = {'flux': flux, **contexts}
 
         def grid(kind, **options):

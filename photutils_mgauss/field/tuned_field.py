@@ -27,7 +27,7 @@ from photutils_mgauss.field.input import normalised
 from photutils_mgauss.psf.gridded import GriddedMixturePSF
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.rows import covariances_of_logs, log_rows
-from photutils_mgauss.utils.validation import as_real, as_shape
+from photutils_mgauss.utils.validation import as_grid_shape, as_real
 
 __all__ = ['TunedMixtureField']
 
@@ -218,7 +218,7 @@ class TunedMixtureField(Field):
             If an argument is not valid.
         """
         if grid_shape is not None or not hasattr(self.start, 'grid_xypos'):
-            grid_shape = as_shape(grid_shape or (30, 30), 'grid_shape')
+            grid_shape = as_grid_shape(grid_shape or (30, 30))
             places = np.column_stack(list(lattice(grid_shape, self.shape)))
         else:
             places = np.asarray(self.start.grid_xypos, float)

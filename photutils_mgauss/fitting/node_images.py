@@ -10,7 +10,7 @@ from photutils.psf import ImagePSF
 from photutils_mgauss.files.epsfs import places_in_meta
 from photutils_mgauss.files.psfex import read_psfex
 from photutils_mgauss.utils import compat
-from photutils_mgauss.utils.validation import as_floats, as_shape
+from photutils_mgauss.utils.validation import as_floats, as_grid_shape
 
 __all__ = ['NodeImages', 'of_gridded_psf', 'of_image_psf', 'of_psfex']
 
@@ -147,7 +147,7 @@ def of_psfex(path, grid_shape, *, limits=None, contexts=None):
     NodeImages
     """
     model = path if hasattr(path, 'image_at') else read_psfex(path)
-    x, y = _psfex_lattice(model, as_shape(grid_shape, 'grid_shape'), limits)
+    x, y = _psfex_lattice(model, as_grid_shape(grid_shape), limits)
     images = [model.image_at(x_0, y_0, **(contexts or {}))
               for x_0, y_0 in zip(x, y, strict=True)]
     return NodeImages(np.array(images), np.column_stack([x, y]),

@@ -16,6 +16,9 @@ _LARGEST = 1e150
 _LONGEST = 2**31 - 1
 # No image has more pixels along an axis.
 _WIDEST = 10**6
+# A grid of PSFs of so many nodes takes ten seconds to make; without a limit,
+# a slip of the pen takes all memory there is.
+_MOST_NODES = 10**5
 
 
 def in_pixels(value, name):
@@ -134,6 +137,16 @@ def as_shape(value, name, *, minimum=1):
         raise ValueError(msg)
     return tuple(as_integer(n, name, minimum=minimum, maximum=_WIDEST)
                  for n in pair)
+
+
+def as_grid_shape(value, name='grid_shape'):
+    """Return the shape (ny, nx) of a grid of PSFs that memory can hold."""
+    ny, nx = as_shape(value, name)
+    if ny * nx > _MOST_NODES:
+        msg = (f'{name} must have at most {_MOST_NODES} nodes, got '
+               f'{ny} x {nx}')
+        raise ValueError(msg)
+    return ny, nx
 
 
 def check_callables(options, names):

@@ -139,6 +139,12 @@ def test_a_grid_is_the_field_at_its_nodes(field):
     assert_allclose(np.sort(node.weights), np.sort(mixture.weights))
 
 
+def test_a_grid_that_no_memory_holds_is_refused_at_once(field):
+    with pytest.raises(ValueError, match=(
+            'grid_shape must have at most 100000 nodes, got 20000 x 20000')):
+        field.to_grid(20000)
+
+
 @pytest.mark.parametrize('blur', [0, 0.4, -0.15])
 def test_the_slope_of_chi2_is_the_right_side_of_the_equations(rng, blur):
     problem = small_problem(rng, np.full((4, 3), blur) * [1, 0.3, 0.8])
