@@ -28,7 +28,7 @@ _FIRST_COMPONENTS = 5
 # light of a pixel unexplained, as strong aberrations do. It is the noise of
 # 40,000 electrons: with less missing, the noise of all but the brightest
 # stars' peaks is larger, and more Gaussians take more time for nothing.
-_MORE_COMPONENTS, _POOR = 8, 0.005
+_MORE_COMPONENTS, POOR = 8, 0.005
 # The fit without some stars starts where the one with all of them ended. It
 # must forget them: no damping.
 _FOLD_STEPS, _FOLD_TOLERANCE, _FOLD_DAMPING = 4, 0.1, 1e-7
@@ -80,8 +80,8 @@ def run_with_enough_components(problem, degree, workers, *, strength=1.0,
     """
     how = {'strength': strength, 'reject': reject}
     fit = stages.run(problem, _USUAL_COMPONENTS, degree, workers,
-                     poor=_POOR, **how)
-    if fit.accuracy < _POOR:
+                     poor=POOR, **how)
+    if fit.accuracy < POOR:
         return fit
     workers.tell(f'{_MORE_COMPONENTS} Gaussians')
     more = stages.run(problem, _MORE_COMPONENTS, degree, workers,

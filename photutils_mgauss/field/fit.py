@@ -23,6 +23,7 @@ from photutils_mgauss.field.beyond import add_degrees
 from photutils_mgauss.field.brighter_fatter import measure_fattening
 from photutils_mgauss.field.choice import (
     MANY_STARS,
+    POOR,
     choose,
     run_with_enough_components,
 )
@@ -31,6 +32,7 @@ from photutils_mgauss.field.covariance import (
     honest_covariance,
     plain_covariance,
 )
+from photutils_mgauss.field.extrapolation import is_wild, widths_beyond
 from photutils_mgauss.field.forms import TunedShapes
 from photutils_mgauss.field.growth import (
     FIRST_RADIUS,
@@ -119,12 +121,15 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         The degree of the polynomials, 0 for a PSF that is the same
         everywhere; by default 4, or 'auto' with 8 to 59 stars, or 1 with
         ``start``. It is lowered, with a warning, if there are too few
-        stars. 'auto' chooses a degree from 0 to 5 in the same way; with
-        fewer than 60 stars the field has the terms of one degree more, and
-        of all up to 4, with a prior about zero, so that errors include what
-        the stars cannot tell of them. Terms that are not significant are
-        shrunk, so that a degree that is too high takes more time but loses
-        little accuracy.
+        stars; the default also if the PSF were else three times as narrow
+        or wide as at any star where no star tells what it is, and a lower
+        degree describes the stars as well. 'auto' chooses a degree from 0
+        to 5 in the same way as the number of Gaussians; with fewer than 60
+        stars the field has the terms of one degree more, and of all up to
+        4, with a prior about zero, so that errors include what the stars
+        cannot tell of them. Terms that are not significant are shrunk, so
+        that a degree that is too high takes more time but loses little
+        accuracy.
     radius : float, optional
         The radius of the circle of fitted pixels [pix]. By default four
         times the width at half maximum of the stars, but at least 10 and
@@ -240,6 +245,10 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
                                     workers)
             field = _free_field(problem, sample, radius, n_components, degree,
                                 top, options, workers)
+            if options.degree is None:
+                field = _tamed(field, lambda lower: _free_field(
+                    sample.problem(lower, options.local_bkg), sample, radius,
+                    n_components, lower, lower, options, workers))
         if options.normalise == 'stamps':
             return field
         return _with_wings(field, sample, read_exposures(*given),
@@ -275,6 +284,27 @@ def _free_field(problem, sample, radius, n_components, degree, top, options,
     fit, fatter = _fatter(fit, options.brighter_fatter, workers,
                           options.reject)
     return _result(fit, sample, radius, choice, options.centre, fatter)
+
+
+def _tamed(field, refit):
+    """Return a field of lower degree if one is wild where no star is."""
+    widths = widths_beyond(field)
+    if not is_wild(*widths):
+        return field
+    lower, left = field, widths
+    while lower.degree > 1 and is_wild(*left):
+        lower = refit(lower.degree // 2)
+        left = widths_beyond(lower)
+    better = (not is_wild(*left)
+              and lower.accuracy <= max(field.accuracy, POOR))
+    warnings.warn(
+        f'where no star tells what it is, the PSF of degree {field.degree} is '
+        f'{widths[0]:.2g} times as narrow to {widths[1]:.2g} times as wide '
+        'as at any star; '
+        + (f'degree {lower.degree} is taken, which describes the stars as well'
+           if better else 'give a lower degree, such as 1, to measure there'),
+        AstropyUserWarning, stacklevel=3)
+    return lower if better else field
 
 
 def _fatter(fit, wanted, workers, reject):
