@@ -256,6 +256,7 @@ def corners(chain):
     return chain, QTable.read(chain / 'corner.fits')
 
 
+@pytest.mark.long
 def test_a_crowded_measurement_makes_the_psf_of_the_image(corners,
                                                           monkeypatch):
     chain, known = corners
@@ -270,6 +271,7 @@ def test_a_crowded_measurement_makes_the_psf_of_the_image(corners,
     np.testing.assert_allclose(*counts, rtol=0.1)
 
 
+@pytest.mark.long
 def test_a_catalogue_remembers_the_wcs_it_was_measured_with(chain,
                                                             monkeypatch):
     monkeypatch.chdir(chain)
@@ -507,6 +509,7 @@ def test_help_comes_without_loading_what_computes():
     assert not {'numpy', 'astropy', 'photutils', 'numba'} & set(loaded)
 
 
+@pytest.mark.long
 def test_images_of_one_field_are_measured_together(corners, monkeypatch):
     chain, alone = corners
     monkeypatch.chdir(chain)

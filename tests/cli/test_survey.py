@@ -106,6 +106,7 @@ def test_the_plan_tells_fields_of_one_exposure(survey, capsys):
             in capsys.readouterr().out)
 
 
+@pytest.mark.long
 def test_a_survey_ends_in_motions_and_runs_only_what_changed(survey, capsys):
     pytest.importorskip('pyarrow')
     folder = survey.parent / 'survey'

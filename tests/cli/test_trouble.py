@@ -275,6 +275,7 @@ def test_help_fits_into_a_terminal(capsys):
 
 # What is said, and where.
 
+@pytest.mark.long
 def test_redirected_output_holds_no_bars(here):
     run = start('photometry', '1.fits', '--psf', 'psf.fits', '--output',
                 'new/', folder=here)
@@ -285,6 +286,7 @@ def test_redirected_output_holds_no_bars(here):
     assert re.search(r'^1.fits: \d+ stars$', out, re.MULTILINE)
 
 
+@pytest.mark.long
 def test_a_terminal_shows_how_far_it_got(here):
     terminal, end = pty.openpty()
     termios.tcsetwinsize(end, (24, 80))
@@ -342,6 +344,7 @@ def test_all_commands_can_be_quiet_and_keep_a_log(command, capsys):
     assert '--log-file' in text
 
 
+@pytest.mark.long
 def test_who_stops_reading_does_not_stop_the_work(here):
     run = start('photometry', '1.fits', '--psf', 'psf.fits', '--output',
                 'new/', folder=here)

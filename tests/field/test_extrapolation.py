@@ -62,6 +62,7 @@ def test_a_psf_that_is_tame_is_left_as_it_is():
         assert _tamed(field, None) is field
 
 
+@pytest.mark.long
 def test_stars_in_a_corner_tell_nothing_of_the_others(rng):
     x, y = rng.uniform(15, 80, (2, 60))
     data = np.zeros((SIDE, SIDE))

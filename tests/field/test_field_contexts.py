@@ -221,6 +221,7 @@ def test_files_keep_colours(field, tmp_path, name):
             assert one.mixture_at(9, 9) == two.mixture_at(9, 9)
 
 
+@pytest.mark.long
 def test_lateral_colour_is_found_from_positions_that_know_nothing_of_it():
     stars = catalogue(4, 1e6, 20)
     image = draw(stars, shift=True)

@@ -90,6 +90,7 @@ def field():
                              n_components=2, normalise='stamps')
 
 
+@pytest.mark.long
 def test_stars_seen_often_are_few_stars(field):
     assert len(field.stars) == N_STARS * N_IMAGES
     assert len(set(field.stars['star'])) == N_STARS
@@ -98,6 +99,7 @@ def test_stars_seen_often_are_few_stars(field):
     assert field.choice['degree'].max() <= 2
 
 
+@pytest.mark.long
 def test_the_psf_is_not_wild_where_no_star_is(field):
     truth = PSF.fwhm
     for x in (0, SIZE - 1):

@@ -168,6 +168,7 @@ def test_what_the_polynomials_miss_is_found_in_stars_left_out():
     assert 0.5 < np.sqrt(np.mean(squares)) < 1.6
 
 
+@pytest.mark.long
 def test_few_stars_have_a_degree_more_than_they_bear_by_themselves():
     squares, off = [], []
     for seed in range(4):

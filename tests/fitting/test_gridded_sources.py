@@ -106,6 +106,7 @@ def airy_grid(fwhm, obscuration, oversampling=4, fine=20, half=11):
                                    'oversampling': oversampling})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(('fwhm', 'obscuration'), [(1.0, 0.0), (1.25, 0.3)])
 def test_defaults_keep_the_fluxes_of_undersampled_airy_patterns(
         fwhm, obscuration):

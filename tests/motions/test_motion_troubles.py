@@ -310,6 +310,7 @@ def scans(rng, *, orbit=0.0, wild=0, n=300, error=0.1):
         for year, x, y in zip(years, east, north, strict=True)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('orbit', [3.0, 25.0])
 def test_a_binary_keeps_its_detections_and_is_flagged(rng, orbit):
     epochs = scans(rng, orbit=orbit)

@@ -151,6 +151,7 @@ def test_not_with_what_is_left_to_photutils(sky_scene):
         phot(data, error=error, init_params=stars)
 
 
+@pytest.mark.long
 def test_crowded_photometry_takes_spikes_for_stars_no_more(sky_scene):
     data, error, stars = sky_scene
     false, found = [], []
