@@ -18,6 +18,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from photutils_mgauss.crowded import psf_stars
 from photutils_mgauss.crowded.far_light import far_light
 from photutils_mgauss.field.base import lattice
+from photutils_mgauss.field.choice import POOR
 from photutils_mgauss.field.fit import fit_mixture_field, with_light_beyond
 from photutils_mgauss.field.stages import n_terms
 from photutils_mgauss.psf.renderer import MixtureRenderer
@@ -49,9 +50,6 @@ _REST = 2e-3
 _LARGEST, _WINDOW, _WINDOWS = 1536, 320, 5
 # Where the PSF of two passes is compared, and how far from its centre [pix].
 _PLACES, _REACH = (3, 3), 8
-# Of Gaussians that miss so much of the light in bright pixels it is asked
-# whether more would miss less, by as much.
-_POOR = 0.005
 # Stars are drawn out to where this fraction of the noise is left of them.
 _FAINTEST = 1e-3
 
@@ -345,13 +343,13 @@ def _fit(solved, psf, used, number, options):
 def _tell_of_few(field, before, solved, number, options):
     """Warn if fewer Gaussians than usual miss light that more would have."""
     n = options.n_components
-    if n >= LoopOptions.n_components or field.accuracy < _POOR:
+    if n >= LoopOptions.n_components or field.accuracy < POOR:
         return
     used = field.stars['x_fit', 'y_fit', 'flux_fit'][field.stars['used']]
     used.rename_columns(used.colnames, ['x', 'y', 'flux'])
     more = _fit(solved, grid_of(before), used, number, replace(
         options, n_components=LoopOptions.n_components, degree=field.degree))
-    if field.accuracy - more.accuracy > _POOR:
+    if field.accuracy - more.accuracy > POOR:
         warnings.warn(
             f'n_components={n} misses {field.accuracy:.1%} of the light in '
             f'the pixels of bright stars: the default of {more.n_components} '

@@ -3,6 +3,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.testing import assert_allclose
 
+from helpers.dithers import dithered
 from photutils_mgauss import (
     GaussianMixture,
     MixturePSFPhotometry,
@@ -27,18 +28,9 @@ def exposures(seed, neighbour):
     x, y = ((np.mgrid[:N_SIDE, :N_SIDE].reshape(2, -1) + 0.5) * SIZE / N_SIDE
             + rng.uniform(-2, 2, (2, N_STARS)))
     off = rng.uniform(-4, 4, (2, N_STARS))
-    images, tables, errors = [], [], []
-    for _ in range(N_IMAGES):
-        shift = rng.uniform(-5, 5, 2)
-        tables.append(Table({'x': x + shift[0], 'y': y + shift[1]}))
-        clean = np.full((SIZE, SIZE), SKY)
-        for i in range(N_STARS):
-            for dx, dy, share in ((0, 0, 1), (*off[:, i], neighbour)):
-                clean += PSF.render(clean.shape, x[i] + shift[0] + dx,
-                                    y[i] + shift[1] + dy, flux=share * FLUX)
-        images.append(rng.normal(clean, np.sqrt(clean)) - SKY)
-        errors.append(np.sqrt(clean))
-    return images, tables, errors
+    return dithered(PSF, SIZE, SKY, (x, y, [FLUX] * N_STARS), (off, neighbour),
+                    N_IMAGES, lambda clean: rng.normal(clean, np.sqrt(clean)),
+                    rng)
 
 
 def pulls(seed, neighbour):

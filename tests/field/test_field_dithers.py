@@ -1,8 +1,8 @@
 """Exposures that show the same stars again: places count, not detections."""
 import numpy as np
 import pytest
-from astropy.table import Table
 
+from helpers.dithers import dithered
 from photutils_mgauss import GaussianMixture, fit_mixture_field
 from photutils_mgauss.field.normal import in_turn
 from photutils_mgauss.field.places import places, same_stars
@@ -74,18 +74,8 @@ def field():
             for _ in range(2))
     flux = rng.uniform(2e4, 6e4, N_STARS)
     off = rng.uniform(-4, 4, (2, N_STARS))
-    images, tables, errors = [], [], []
-    for _ in range(N_IMAGES):
-        shift = rng.uniform(-5, 5, 2)
-        tables.append(Table({'x': x + shift[0], 'y': y + shift[1]}))
-        clean = np.full((SIZE, SIZE), SKY)
-        for i in range(N_STARS):
-            for dx, dy, share in ((0, 0, 1), (*off[:, i], 0.02)):
-                clean += PSF.render(clean.shape, x[i] + shift[0] + dx,
-                                    y[i] + shift[1] + dy,
-                                    flux=share * flux[i])
-        images.append(rng.poisson(clean) - SKY)
-        errors.append(np.sqrt(clean))
+    images, tables, errors = dithered(
+        PSF, SIZE, SKY, (x, y, flux), (off, 0.02), N_IMAGES, rng.poisson, rng)
     return fit_mixture_field(images, tables, error=errors, radius=6,
                              n_components=2, normalise='stamps')
 
