@@ -257,10 +257,12 @@ class StarImage:
             'or FLUXCONV [MJy/sr per DN/s], whose GAIN * EXPTIME / PHOTMJSR '
             'is that number of electrons'
             if is_surface_brightness(self.unit) else '')
+        problem = self.layers.cards.gain_problem
+        problem = problem and f'; {problem}'
         return (f'{self.path}: the noise must be known; it has neither an '
                 f'extension ERR nor a file beside it, and for an image with '
                 f'{unit} it takes --gain (electrons in a count or unit) and, '
-                f'for rates, --exposure-time{header}')
+                f'for rates, --exposure-time{header}{problem}')
 
     def check(self):
         """Raise if the image lacks what it takes to measure it."""

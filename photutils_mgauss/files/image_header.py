@@ -14,6 +14,11 @@ _EXPOSURE_TIME = ('EXPTIME', 'XPOSURE', 'EFFEXPTM', 'TEXPTIME', 'EXPOSURE')
 # MJy/sr for one DN/s.
 _CONVERSION = ('PHOTMJSR', 'FLUXCONV')
 _START = ('EXPSTART', 'MJD-BEG', 'MJD-OBS')
+# The outputs of ESO's detectors: electrons in a count, its inverse, and the
+# noise of the readout; and by how much the first two may disagree.
+_OUTPUT = 'ESO DET OUT{} {}'
+_MOST_OUTPUTS = 64
+_DISAGREE = 0.1
 _SATURATION = ('SATURATE', 'SATLEVEL', 'SATURAT')
 
 # Numbers in headers are smaller, which leaves out infinity.
@@ -85,8 +90,58 @@ class Cards:
                 return float(value)
         return None
 
-    gain = _positive(_GAIN, 'Electrons in a count.')
-    read_noise = _positive(_READ_NOISE, 'The noise of the readout [electron].')
+    @property
+    def gain(self):
+        """
+        Electrons in a count, or None.
+
+        Of ESO's outputs it is None unless all have the same; see
+        `gain_problem`.
+        """
+        gains = self._output_gains
+        return self.positive(*_GAIN) or (
+            gains[0] if len(set(gains)) == 1 and not self._contradicts
+            else None)
+
+    @property
+    def gain_problem(self):
+        """Why gains that a header has are not used, '' if they are."""
+        gains = self._output_gains
+        if self.gain is not None or not gains:
+            return ''
+        if self._contradicts:
+            return ('its keywords ESO DET OUTn CONAD and GAIN are not the '
+                    'inverse of each other')
+        return ('its outputs have different gains (ESO DET OUTn CONAD): '
+                + ', '.join(f'{one:g}' for one in sorted(set(gains))))
+
+    @property
+    def read_noise(self):
+        """The noise of the readout [electron], or None."""
+        noises = {noise for noise in self._outputs('RON') if noise}
+        return self.positive(*_READ_NOISE) or (
+            noises.pop() if len(noises) == 1 else None)
+
+    def _outputs(self, word):
+        """Return a number of each of ESO's outputs, None if it has none."""
+        return [self.positive(_OUTPUT.format(n, word))
+                for n in range(1, _MOST_OUTPUTS + 1)]
+
+    @property
+    def _output_gains(self):
+        return [electrons or 1 / counts for electrons, counts in zip(
+            self._outputs('CONAD'), self._outputs('GAIN'), strict=True)
+            if electrons or counts]
+
+    @property
+    def _contradicts(self):
+        """Whether the two gains of one output cannot both be right."""
+        return any(electrons and counts
+                   and abs(electrons * counts - 1) > _DISAGREE
+                   for electrons, counts in zip(
+                       self._outputs('CONAD'), self._outputs('GAIN'),
+                       strict=True))
+
     exposure_time = _positive(_EXPOSURE_TIME, 'The exposure time [s].')
     conversion = _positive(_CONVERSION, 'MJy/sr for a count each second.')
     saturation = _positive(

@@ -16,6 +16,7 @@ from photutils_mgauss import kernels
 from photutils_mgauss.psf.base import PSFModel
 from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.rows import falls
+from photutils_mgauss.utils.image import FITTED_BY
 from photutils_mgauss.utils.parallel import Threads, map_parallel
 from photutils_mgauss.utils.waiting import progress
 
@@ -110,20 +111,15 @@ def is_fixed_shape(model):
             and (model.interpolation, model.outside) == ('blend', 'clamp'))
 
 
-# What to use instead of photutils' models.
-_INSTEAD = {
-    'GriddedPSFModel': '`GriddedMixturePSF.from_gridded_psf(psf_model)`',
-    'ImagePSF': '`GriddedMixturePSF.from_image_psf(psf_model)`',
-}
-
-
 def why_not(model):
     """Return why the kernels cannot fit a model, and what to do about it."""
     if not isinstance(model, PSFModel):
         name = type(model).__name__
-        instead = _INSTEAD.get(
-            name, 'a `MultiGaussianPSFModel`, whose mixture `fit_mixture` '
-            'makes of an image of the PSF')
+        instead = (
+            f'`GriddedMixturePSF.{FITTED_BY[name]}(psf_model)`'
+            if name in FITTED_BY else
+            'a `MultiGaussianPSFModel`, whose mixture `fit_mixture` makes of '
+            'an image of the PSF')
         return f'psf_model is a {name}', f'use {instead}'
     if not model.has_fixed_shape:
         free = [name for name in model.param_names[3:]

@@ -208,6 +208,11 @@ def check_errors(error, used):
         raise ValueError(msg)
 
 
+# What fits mixtures to photutils' models of images.
+FITTED_BY = {'GriddedPSFModel': 'from_gridded_psf',
+             'ImagePSF': 'from_image_psf'}
+
+
 # From what a user gives to plain arrays.
 
 def _read(data, error, mask, name, ndims, broadcast):
@@ -321,8 +326,12 @@ def _numbers(value, name):
     if array.dtype.kind not in 'buif':
         got = array.dtype if array.ndim else f'{value!r:.80}'
         one = value[0] if isinstance(value, (list, tuple)) else value
+        kind = type(one).__name__
         if hasattr(one, 'header'):
-            got = f'{type(one).__name__}: give its .data'
+            got = f'{kind}: give its .data'
+        elif kind in FITTED_BY:
+            got = (f'{kind}: `GriddedMixturePSF.{FITTED_BY[kind]}` fits '
+                   'mixtures to it')
         msg = f'{name} must be an array of numbers, got {got}'
         raise TypeError(msg)
     if array.dtype.kind == 'b':

@@ -297,6 +297,42 @@ def test_a_number_written_as_text_is_a_number(value, number):
     assert Cards({'GAIN': value}).gain == number
 
 
+def eso(word, *values):
+    return {f'ESO DET OUT{n} {word}': value
+            for n, value in enumerate(values, start=1)}
+
+
+@pytest.mark.parametrize(('cards', 'gain', 'read_noise'), [
+    ({**eso('CONAD', 2.0), **eso('GAIN', 0.5), **eso('RON', 4.5)}, 2.0, 4.5),
+    ({**eso('CONAD', 2.9), **eso('GAIN', 0.34), **eso('RON', 0.0)}, 2.9,
+     None),
+    (eso('GAIN', 0.5, 0.5), 2.0, None),
+    ({**eso('CONAD', 2.0, 2.0), **eso('RON', 4.0, 5.0)}, 2.0, None),
+    ({**eso('CONAD', 2.0), 'GAIN': 1.5}, 1.5, None)])
+def test_the_outputs_of_eso_have_gains(tmp_path, sky, cards, gain,
+                                       read_noise):
+    path = tmp_path / 'eso.fits'
+    fits.PrimaryHDU(sky, fits.Header({f'HIERARCH {key}' if ' ' in key else
+                                      key: value for key, value in
+                                      cards.items()})).writeto(path)
+    image = read_image(path)
+    assert image.noise.gain == gain
+    assert image.layers.cards.read_noise == read_noise
+
+
+@pytest.mark.parametrize(('cards', 'words'), [
+    (eso('CONAD', 2.0, 2.1), r'--gain.*different gains .*: 2, 2\.1$'),
+    ({**eso('CONAD', 2.0), **eso('GAIN', 2.0)},
+     '--gain.*CONAD and GAIN are not the inverse of each other$')])
+def test_outputs_without_one_gain_are_told(tmp_path, sky, cards, words):
+    path = tmp_path / 'eso.fits'
+    fits.PrimaryHDU(sky, fits.Header({f'HIERARCH {key}': value for key, value
+                                      in cards.items()})).writeto(path)
+    with pytest.raises(ValueError, match=words):
+        _ = read_image(path).noise
+    assert read_image(path, Reading(gain=1.5)).noise.gain == 1.5
+
+
 @pytest.mark.parametrize(('kind', 'level', 'cards'), [
     ('u2', 65535, {}), ('i2', 32767, {}), ('u1', 255, {}),
     ('u2', 65535, {'SATURATE': 70000.0})])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose
+from photutils.psf import ImagePSF
 from scipy.optimize import least_squares
 
 from helpers.compiled import compiled
@@ -288,6 +289,8 @@ def test_threads_processes_and_no_pool_give_the_same_fits():
     ({'image': np.ones(9)}, ValueError, r'image must have shape \(ny, nx\)'),
     ({'image': np.ones((0, 4))}, ValueError, 'image must'),
     ({'image': 'psf'}, TypeError, 'image must be an array of numbers'),
+    ({'image': ImagePSF(np.ones((5, 5)))}, TypeError,
+     r'got ImagePSF: `GriddedMixturePSF\.from_image_psf` fits'),
     ({'n_components': 0}, ValueError, 'n_components must be at least 1'),
     ({'n_components': 1.5}, TypeError, 'n_components must be an integer'),
     ({'oversampling': 0}, ValueError, 'oversampling must be at least 1'),
