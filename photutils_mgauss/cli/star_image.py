@@ -276,7 +276,7 @@ class StarImage:
         places = [f'{what} {where}'
                   for what, where in self.layers.sources.items()]
         if self.layers.error is None:
-            places.append('error from sky and gain')
+            places.append(self._say_noise())
         words = [f'{nx} x {ny} pixels', ', '.join(places),
                  f'{self.mask.mean():.1%} bad']
         words.append('no WCS' if self.wcs is None else
@@ -284,6 +284,14 @@ class StarImage:
         words.append('no time' if self.time is None else
                      f'{julian_years(self.time):.3f}{self._say_day()}')
         return f'{self.path}: {"; ".join(words)}'
+
+    def _say_noise(self):
+        known = self._or_header('read_noise')
+        if known is not None:
+            return f'error from sky, gain and a read noise of {known:g} e'
+        problem = self.layers.cards.read_noise_problem
+        return ("error from gain and the sky's scatter, which holds the read "
+                'noise' + (f' ({problem})' if problem else ''))
 
     def _say_day(self):
         known = (self.reading.time is not None

@@ -117,10 +117,23 @@ class Cards:
 
     @property
     def read_noise(self):
-        """The noise of the readout [electron], or None."""
-        noises = {noise for noise in self._outputs('RON') if noise}
+        """The noise of the readout [electron], or None; see `gain`."""
+        noises = self._output_noises
         return self.positive(*_READ_NOISE) or (
-            noises.pop() if len(noises) == 1 else None)
+            noises[0] if len(noises) == 1 else None)
+
+    @property
+    def read_noise_problem(self):
+        """Why read noises that a header has are not used, '' if they are."""
+        noises = self._output_noises
+        if self.read_noise is not None or not noises:
+            return ''
+        return ('its outputs have different read noises (ESO DET OUTn RON): '
+                + ', '.join(f'{one:g}' for one in noises))
+
+    @property
+    def _output_noises(self):
+        return sorted({noise for noise in self._outputs('RON') if noise})
 
     def _outputs(self, word):
         """Return a number of each of ESO's outputs, None if it has none."""

@@ -318,6 +318,11 @@ def test_the_outputs_of_eso_have_gains(tmp_path, sky, cards, gain,
     image = read_image(path)
     assert image.noise.gain == gain
     assert image.layers.cards.read_noise == read_noise
+    said = (f'gain and a read noise of {read_noise:g} e' if read_noise else
+            "gain and the sky's scatter")
+    assert said in image.describe()
+    assert ('read noises (ESO DET OUTn RON): 4, 5)' in image.describe()) == (
+        eso('RON', 4.0, 5.0).items() <= cards.items())
 
 
 @pytest.mark.parametrize(('cards', 'words'), [
