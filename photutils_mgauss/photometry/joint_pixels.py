@@ -108,13 +108,7 @@ class JointImages:
         ``boxes`` (g, m, 4) are those of the stars, ``own`` (g, m, 3) light to
         add, or None.
         """
-        pixels = self.images[k].groups(boxes, own, self.psfs[k])
-        if (pixels.n_pixels < 0).any():
-            msg = ('images must have positive and finite errors under the '
-                   f'stars, got one that is not in image {k}; mask such '
-                   'pixels')
-            raise ValueError(msg)
-        return pixels
+        return self.images[k].groups(boxes, own, self.psfs[k])
 
 
 @dataclass(frozen=True, eq=False)

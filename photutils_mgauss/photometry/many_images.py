@@ -264,7 +264,7 @@ def fit_many(images, coordinates, *, fit_shape=11, common_flux=False):
     Raises
     ------
     TypeError, ValueError
-        If an argument is not valid, or an error not positive under a star.
+        If an argument is not valid.
 
     Examples
     --------
@@ -314,7 +314,8 @@ def joint_images(pixels, psfs, shared, *, fit_sky, factors=None):
     Parameters
     ----------
     pixels : sequence of `~photutils_mgauss.utils.image.PixelData`
-        They are not copied.
+        They are not copied. Pixels with errors that are not positive and
+        finite are not used.
     psfs : sequence of `~photutils_mgauss.psf.base.PSFModel`
         Of fixed shape.
     shared : (E,) `~numpy.ndarray` of int
@@ -335,7 +336,7 @@ def joint_images(pixels, psfs, shared, *, fit_sky, factors=None):
     scale = float(np.median([
         _typical(one.with_error().error) * factor
         for one, factor in zip(pixels, factors, strict=True)]))
-    images = [ScaledImage(one, scale / factor)
+    images = [ScaledImage(one.with_bad_masked(), scale / factor)
               for one, factor in zip(pixels, factors, strict=True)]
     return JointImages(images, [psf_arrays(psf) for psf in psfs],
                        np.asarray(shared), fit_sky), scale

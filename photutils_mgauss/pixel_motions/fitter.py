@@ -34,6 +34,7 @@ from photutils_mgauss.pixel_motions.tables import (
     WANDERED,
     chi2_of,
     image_table,
+    misfit_notes,
     shift_notes,
     star_table,
 )
@@ -268,8 +269,9 @@ class PixelMotionFitter:
         notes = campaign.notes + _coverage(campaign, solved)
         if frames is not None:
             notes += frames.notes
-        if not self.forced:
-            notes += shift_notes(images)
+        shifts = () if self.forced else shift_notes(images)
+        # An image that lies elsewhere explains what does not fit.
+        notes += shifts or misfit_notes(table, campaign.estimated)
         return PixelMotionSolution(table, images, notes, campaign, listed,
                                    solved, errors)
 

@@ -15,6 +15,9 @@ NOT_CONVERGED, POSITION_ONLY, WANDERED = 65536, 131072, 262144
 # Shifts of an image against the others that are told: in pixels, and in
 # standard errors; and from how many stars of what significance.
 _SHIFT, _SURE, _FEW, _BRIGHT = 0.05, 6.0, 5, 5.0
+# Misfits are told from this part of the stars on, with chi2 of so many times
+# the degrees of freedom.
+_MANY, _MISFIT = 0.05, 2.0
 
 
 def star_table(campaign, listed, solved, errors, *, forced, relative):
@@ -195,8 +198,30 @@ def shift_notes(table):
     away, sure = np.hypot(*shift.T), np.hypot(*error.T)
     with np.errstate(invalid='ignore'):
         wrong = (away > _SHIFT) & (away > _SURE * sure)
+    # One wrong image draws the stars, and then others lie beside them, too.
+    worst = sorted(np.flatnonzero(wrong), key=lambda k: -away[k] / sure[k])
     return tuple(
         f'Image {k} lies {away[k]:.2f} pixels ({shift[k, 0]:+.2f}, '
         f'{shift[k, 1]:+.2f}) beside the place that its WCS and the other '
-        'images give: correct the WCS with ProperMotionFitter.'
-        for k in np.flatnonzero(wrong))
+        'images give: correct the WCS with ProperMotionFitter'
+        + (f' (perhaps only because of image {worst[0]}).' if n else '.')
+        for n, k in enumerate(worst))
+
+
+def misfit_notes(table, estimated):
+    """Return a sentence if many stars are not what the images show."""
+    # Scaled errors hide it.
+    if estimated or not len(table):
+        return ()
+    with np.errstate(invalid='ignore', divide='ignore'):
+        misfits = table['reduced_chi2'] > np.maximum(
+            _MISFIT, 1 + _SURE * np.sqrt(2 / table['dof']))
+    n, many = int(misfits.sum()), len(table)
+    if n < max(2, _MANY * many):
+        return ()
+    note = (f'The residuals of {n} of {many} stars are larger than their '
+            f'errors allow (reduced_chi2 above {_MISFIT:g}); their motions '
+            'may be wrong by more than their errors. Mask cosmic rays and bad '
+            'pixels, and look at the PSFs and at close pairs with '
+            'solution.cutouts.')
+    return (note,)

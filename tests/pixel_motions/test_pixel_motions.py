@@ -6,6 +6,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
+from astropy.nddata import NDData, StdDevUncertainty
 from astropy.table import QTable
 from astropy.utils.exceptions import AstropyUserWarning
 from numpy.testing import assert_allclose
@@ -146,7 +147,6 @@ def test_stars_at_rest_in_one_image_are_those_of_fit_many(rng):
     with pytest.warns(AstropyUserWarning, match='at one time'):
         table = PixelMotionFitter(fit_sky=False).fit(
             images, stars['ra', 'dec']).stars
-    from astropy.nddata import NDData, StdDevUncertainty
     image = images[0]
     want = fit_many([(NDData(image.data, uncertainty=StdDevUncertainty(
         np.full(image.data.shape, image.error))), image.psf, image.wcs)],
@@ -469,6 +469,55 @@ def test_an_image_whose_wcs_is_off_by_a_pixel_is_found_and_said(rng):
     assert 'Image 2 lies' in said
     away = solution.images['shift'].value
     assert_allclose(away[2], [-1, 0], atol=0.1)
+
+
+def test_the_image_that_is_most_off_is_told_first(rng):
+    x, y = (a.ravel() for a in np.meshgrid([12, 30, 48.0], [12, 30, 48.0]))
+    stars = truth(x, y)
+    images = observe(stars, 3000.0, np.arange(2020, 2026), rng)
+    wcs = images[1].wcs.deepcopy()
+    wcs.wcs.crpix += [1.0, 1.0]
+    images[1] = replace(images[1], wcs=wcs)
+    solution, _ = fit_with_notes(images, stars['ra', 'dec'])
+    assert solution.notes[0].startswith('Image 1 lies')
+    assert all('(perhaps only because of image 1)' in note
+               for note in solution.notes[1:])
+
+
+@pytest.mark.parametrize('error', [0.0, -1.0, np.nan, np.inf])
+def test_pixels_without_a_usable_error_are_left_out(rng, error):
+    star = truth(30.2, 29.6, (20, 10))
+    images = observe(star, 2000.0, YEARS, rng)
+    bad = np.zeros((60, 60), bool)
+    bad[28, ::2] = bad[33] = True
+    masked, marked = ([replace(image, **(
+        {'mask': bad} if mask else {'error': np.where(bad, error, 3.0)}))
+        for image in images] for mask in (True, False))
+    want, table = (PixelMotionFitter().fit(some, star['ra', 'dec']).stars
+                   for some in (masked, marked))
+    for name in ('pmra', 'pmra_error', 'flux', 'reduced_chi2'):
+        assert_allclose(table[name].value, want[name].value, rtol=1e-12)
+    want, table = (fit_many(
+        [(NDData(image.data, mask=image.mask,
+                 uncertainty=StdDevUncertainty(np.broadcast_to(
+                     image.error, image.data.shape))), image.psf, image.wcs)
+         for image in some], SkyCoord(star['ra'], star['dec']), fit_shape=9)
+        for some in (masked, marked))
+    assert_allclose(table['flux_fit'].value, want['flux_fit'].value,
+                    rtol=1e-12)
+
+
+def test_many_stars_hit_by_cosmic_rays_are_said(rng):
+    x, y = (a.ravel() for a in np.meshgrid([12, 30, 48.0], [12, 30, 48.0]))
+    stars = truth(x, y)
+    images = observe(stars, 500.0, YEARS, rng)
+    assert fit_with_notes(images, stars['ra', 'dec'])[1] == ''
+    for image in images:
+        row, column = rng.integers(0, 60, (2, 40))
+        image.data[row, column] += rng.uniform(200, 5000, 40)
+    said = fit_with_notes(images, stars['ra', 'dec'])[1]
+    assert 'Mask cosmic rays' in said
+    assert 'of 9 stars' in said
 
 
 def test_stars_that_no_image_shows_are_not_numbers_and_flagged(rng):
