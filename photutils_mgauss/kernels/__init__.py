@@ -78,7 +78,7 @@ __getattr__, __dir__, __all__ = hand_on(__name__, {
     'field_model': 'field_fit',
     'field_normal': 'field_fit',
     'evaluate': 'gaussian',
-    'gradient': 'gaussian',
+    'evaluate_slopes': 'gaussian',
     'derivatives': 'gaussian',
     'model_rows': 'gaussian',
     'differentiate_grid': 'grid',

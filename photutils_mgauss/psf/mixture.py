@@ -278,9 +278,9 @@ class GaussianMixture(ComparedByValue):
         array([-0.09653235, -0.        ])
         """
         x, y, shape = _points(x, y)
-        out = np.empty((2, x.size))
-        kernels.gradient(x, y, self.rows, bool(pixel_integrated), out)
-        return np.moveaxis(out.reshape(2, *shape), 0, -1)
+        out = np.empty((3, x.size))
+        kernels.evaluate_slopes(x, y, self.rows, bool(pixel_integrated), out)
+        return np.moveaxis(-out[1:].reshape(2, *shape), 0, -1)
 
     def render(self, shape, x_0, y_0, *, flux=1, pixel_integrated=False):
         """

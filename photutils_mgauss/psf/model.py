@@ -301,10 +301,11 @@ class MultiGaussianPSFModel(PSFModel):
             tied to it. The derivatives by fixed parameters, which no fit
             uses, are set to zero and not computed.
         """
-        parameters = self._all_parameters()
-        tied = [bool(one.tied) for one in parameters]
-        free = [is_tied or not one.fixed
-                for one, is_tied in zip(parameters, tied, strict=True)]
+        tied, free = [], []
+        for one in self._all_parameters():
+            is_tied = bool(one.tied)
+            tied.append(is_tied)
+            free.append(is_tied or not one.fixed)
         values = flux, x_0, y_0, *shape
         flux = float(np.squeeze(split_flux(flux)[0]))
         dx = np.asarray(x, float) - np.squeeze(x_0)
@@ -323,9 +324,9 @@ class MultiGaussianPSFModel(PSFModel):
 
     def _position_derivatives(self, dx, dy, flux, rows):
         out = np.empty((3, dx.size))
-        kernels.evaluate(dx, dy, rows, self._pixel_integrated, out[0])
-        kernels.gradient(dx, dy, rows, self._pixel_integrated, out[1:])
-        return [out[0], -flux * out[1], -flux * out[2]]
+        kernels.evaluate_slopes(dx, dy, rows, self._pixel_integrated, out)
+        out[1:] *= flux
+        return list(out)
 
     def _all_derivatives(self, dx, dy, flux, shape, free):
         derivatives = np.empty((self._n_components, 6, dx.size))
