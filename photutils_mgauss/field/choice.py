@@ -29,12 +29,17 @@ _FIRST_COMPONENTS = 5
 # 40,000 electrons: with less missing, the noise of all but the brightest
 # stars' peaks is larger, and more Gaussians take more time for nothing.
 _MORE_COMPONENTS, POOR = 8, 0.005
+# From so many stars on, left-out ones decide between the two numbers instead:
+# the noise of fewer hides what six Gaussians miss.
+_HUNDREDS = 300
 # The fit without some stars starts where the one with all of them ended. It
 # must forget them: no damping.
 _FOLD_STEPS, _FOLD_TOLERANCE, _FOLD_DAMPING = 4, 0.1, 1e-7
 # A higher degree than the usual one is tried if the last step up has gained
-# more than so many standard deviations.
-_CLEAR_GAIN = 3.0
+# more than so many standard deviations. Hundreds of stars ask for more
+# Gaussians if these gain that, and this much of a star's chi^2: what misses
+# less moves no star by more than its own noise, and may be a poor start.
+_CLEAR_GAIN, _LEAST_GAIN = 3.0, 1.0
 
 
 def n_folds(n_stars):
@@ -61,7 +66,8 @@ def run_with_enough_components(problem, degree, workers, *, strength=1.0,
     """
     Fit the usual number of Gaussians to many stars, or more if need be.
 
-    Whether it is too few is known before that fit is finished.
+    Hundreds of stars decide by those left out, fewer by what the usual
+    number misses. Either is known before that fit is finished.
 
     Parameters
     ----------
@@ -79,20 +85,22 @@ def run_with_enough_components(problem, degree, workers, *, strength=1.0,
         Of more Gaussians only if these err less.
     """
     how = {'strength': strength, 'reject': reject}
+    hundreds = problem.n_places >= _HUNDREDS
     fit = stages.run(problem, _USUAL_COMPONENTS, degree, workers,
-                     poor=POOR, **how)
-    if fit.accuracy < POOR:
+                     poor=0.0 if hundreds else POOR, **how)
+    if not hundreds and fit.accuracy < POOR:
         return fit
     workers.tell(f'{_MORE_COMPONENTS} Gaussians')
     more = stages.run(problem, _MORE_COMPONENTS, degree, workers,
-                      course=stages.BRISK, poor=fit.accuracy, **how)
-    if more.accuracy >= fit.accuracy:
+                      course=stages.BRISK, poor=0.0, **how)
+    if not (_describes_more(fit, more, workers) if hundreds
+            else more.accuracy < fit.accuracy):
         return stages.finish(fit, workers, reject)
     _LOG.info('%d Gaussians miss %.1f %% of the light in bright pixels: '
               'the field has %d, which miss %.1f %%',
               _USUAL_COMPONENTS, 100 * fit.accuracy,
               _MORE_COMPONENTS, 100 * more.accuracy)
-    return more
+    return stages.finish(more, workers, reject, stages.BRISK)
 
 
 def choose(problem, n_components, degree, max_degree, strength, workers):
@@ -176,11 +184,18 @@ def _best_degree(problem, n_components, top, strength, workers, tried):
     return int(np.argmin(scores))
 
 
-def _clear(before, after):
+def _describes_more(before, after, workers):
+    """Return whether a fit describes left-out stars better than another."""
+    n_pixels = np.median(before.problem.stamps.good.sum(axis=(1, 2)))
+    return _clear(*(_left_out(fit, workers) for fit in (before, after)),
+                  _LEAST_GAIN / n_pixels)
+
+
+def _clear(before, after, least=0.0):
     """Return whether the chi^2 of the stars has clearly become lower."""
     gain = (before - after)[_fair(np.array([before, after]))]
     error = gain.std() / np.sqrt(max(gain.size, 1))
-    return gain.mean() > _CLEAR_GAIN * error
+    return gain.mean() > max(_CLEAR_GAIN * error, least)
 
 
 def _mean(chi2):

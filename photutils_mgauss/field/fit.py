@@ -113,10 +113,11 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
     n_components : int or 'auto', optional
         The number K of Gaussians; 'auto' chooses the number from 2 to 7
         that best describes stars left out of the fit. By default it is
-        'auto' with 8 to 59 stars, and else 6; with 60 stars or more it
-        becomes 8, in twice the time, where 6 miss 0.5 % of the light of
-        bright pixels and stars are not so narrow that pixels are
-        integrated.
+        'auto' with 8 to 59 stars, and else 6. It becomes 8, in twice the
+        time, where 6 miss 0.5 % of the light of bright pixels of 60 stars
+        or more, or where 300 stars or more, when left out of the fit, are
+        clearly better described by 8; not if stars are so narrow that
+        pixels are integrated.
     degree : int or 'auto', optional
         The degree of the polynomials, 0 for a PSF that is the same
         everywhere; by default 4, or 'auto' with 8 to 59 stars, or 1 with
