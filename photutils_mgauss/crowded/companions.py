@@ -19,6 +19,7 @@ from photutils_mgauss.crowded.bright import BESIDE, DOUBTFUL
 from photutils_mgauss.crowded.bright_errors import pixels_of
 from photutils_mgauss.crowded.confusion import square_of_one
 from photutils_mgauss.crowded.search import LEAST, SEPARATION
+from photutils_mgauss.utils.matrices import with_unit_diagonal
 
 # Companions are looked at so far outside of what is masked [pix].
 _OUTSIDE = 4
@@ -82,7 +83,9 @@ def _moves(model, star, doubt, flux):
     s = model.stars
     row, column, design, variance, half = pixels_of(model, star)
     weighed = design / variance
-    covariance = np.linalg.pinv(weighed @ design.T, hermitian=True)
+    matrix, scale = with_unit_diagonal(weighed @ design.T)
+    covariance = (np.linalg.pinv(matrix, hermitian=True) / scale
+                  / scale[:, None])
     y, x = (int(np.rint(at[star])) for at in (s.y, s.x))
     reach = min(int(s.core[star]) + _OUTSIDE, half)
     dy, dx = (at.ravel() for at in np.indices((2 * reach + 1,) * 2) - reach)

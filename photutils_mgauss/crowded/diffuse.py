@@ -21,6 +21,8 @@ _LEAST = 4.0
 # Pixels further than this from the light beneath them count for less.
 _HUBER = 1.5
 _ROUNDS = 3
+# The least noise of blocks in units of what information says.
+_ROUNDING = 1e-12
 _ROUGH = np.outer([1, -2, 1], [1, -2, 1]) / 6
 
 
@@ -49,7 +51,7 @@ class Diffuse:
         Returns by how much the levels of a mesh of wider nodes are to rise.
         """
         faint = self.mesh.faint_level(data, good, noise)
-        wide = self._take(faint, np.ones(faint.size), mesh, noise)
+        wide = self._take(faint, np.full(faint.size, noise**-2.0), mesh, noise)
         # Stars are under it yet: no more than what stands out is believed.
         self.level = _beyond(self.level, noise)
         return wide
@@ -139,4 +141,5 @@ def _local_mean(level, information, noise, scale):
     mean = gaussian_filter(information * level, scale) / total
     # Of white noise a Gaussian of this size leaves so much.
     n_blocks = max(4 * np.pi * scale**2, 1)
-    return mean, np.sqrt(noise / (total * n_blocks) + 1e-12)
+    # Of an image without noise rounding is left.
+    return mean, np.sqrt((noise + _ROUNDING) / (total * n_blocks))

@@ -111,6 +111,7 @@ def _equations(residual, variance, light, stars, edges, spacing):
     terms = np.array([*(image[seen] for image in _wings(points, edges[-1])),
                       *terms])
     total, scatter = total[seen], 1.0
+    _without_units(terms, total)
     share = np.ones(total.size)
     # One of the slopes says as well as all what is far off.
     some = np.append(_USUAL, np.arange(SLOPES.size, len(terms)))
@@ -125,6 +126,16 @@ def _equations(residual, variance, light, stars, edges, spacing):
         share = 1 / np.maximum(np.abs(off) / (_HUBER * scatter), 1)
     return _without_last(matrix / scatter**2, right / scatter**2,
                          SLOPES.size + _N_RINGS)
+
+
+def _without_units(terms, total):
+    """Bring the sky to the size of the light of stars, in place."""
+    # What of the sky is small beside it must not depend on the unit.
+    size = np.sqrt((terms**2) @ total)
+    n = SLOPES.size + _N_RINGS
+    light, sky = size[:n].max(initial=0), size[n:].max(initial=0)
+    if light > 0 and sky > 0:
+        terms[n:] *= light / sky
 
 
 def _solve(matrix, right):

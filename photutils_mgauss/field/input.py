@@ -324,9 +324,10 @@ def _with_neighbours(sources, index, stamps):
     flux = sources.flux.copy()
     known = np.isfinite(sources.x) & np.isfinite(sources.y)
     inner = stamps.offsets() <= 3.5
+    noise = np.sqrt((stamps.base * inner).sum(axis=(1, 2)))
     flux[index] = np.where(
         flux[index] > 0, flux[index],
-        np.maximum((stamps.data * inner).sum(axis=(1, 2)), 1e-3))
+        np.maximum((stamps.data * inner).sum(axis=(1, 2)), 1e-3 * noise))
     known &= np.isfinite(flux) & (flux > 0)
     known_rows = np.flatnonzero(known)
     tree = KDTree(np.column_stack([sources.x, sources.y])[known])

@@ -112,7 +112,9 @@ def _sums(residual, light, own, by_shapes, covariance):
               - free.T @ covariance @ free)
     square = light**2
     # Rows are flux, x, y: what a residual of one does to each of them.
-    moves = np.linalg.pinv(own.T)[1:3]
+    size = np.linalg.norm(own, axis=1)[:, None]
+    size[size == 0] = 1
+    moves = (np.linalg.pinv((own / size).T) / size)[1:3]
     weight = (moves**2).sum(axis=0) * square
     return (weight @ residual**2, weight @ np.diag(matrix),
             weight @ matrix**2 @ square)

@@ -92,10 +92,13 @@ def _without_others(image, model, result, fitted):
         axis=0)])
     own = np.zeros(image.data.shape)
     shapes, which = np.unique(result.shapes, axis=0, return_inverse=True)
-    for k, shape in enumerate(shapes):
+    # Smaller light than this is lost by rounding beside the brightest star.
+    faintest = np.finfo(float).eps * np.abs(stars[2, fitted]).max(
+        initial=0, where=np.isfinite(stars[2, fitted]))
+    for k, shape in enumerate(shapes if faintest > 0 else ()):
         # Where fits started stars may have been pixels away.
         own += MixtureRenderer(model).image(
-            stars[:, fitted & (which.ravel() == k)], 1e-300, own.shape,
+            stars[:, fitted & (which.ravel() == k)], faintest, own.shape,
             shape + 2 * _BESIDE)
     data = left + own
     if not (image.gain and image.error.size):

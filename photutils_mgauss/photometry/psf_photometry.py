@@ -43,7 +43,7 @@ from photutils_mgauss.photometry.wing_errors import (
 )
 from photutils_mgauss.utils import compat
 from photutils_mgauss.utils.correlated_noise import noise_correlation
-from photutils_mgauss.utils.image import read_pixels, with_unit
+from photutils_mgauss.utils.image import PixelData, read_pixels, with_unit
 from photutils_mgauss.utils.per_thread import PerThread, keep
 from photutils_mgauss.utils.saturation import as_saturation
 from photutils_mgauss.utils.star_columns import plain_values
@@ -95,7 +95,7 @@ class MixturePSFPhotometry(PSFPhotometry):
     effective_gain : float, optional
         If given, ``error`` has only the noise of the background, and the noise
         of the stars' own light is added: light divided by ``effective_gain``,
-        in the same units.
+        in the same units. Without ``error`` the former is estimated.
     variance : {'model', 'data'}, optional
         Whether the variance uses the light of the fitted model or of the
         pixels. With the pixels (Eq. 10 of Nie et al.), those that are low by
@@ -431,9 +431,11 @@ class MixturePSFPhotometry(PSFPhotometry):
 
     def _make_image(self, data, mask, error):
         gain = self.effective_gain
+        if gain is not None and error is None:
+            # Photons alone would leave faint pixels without an error.
+            error = PixelData(data, None, mask).with_error().error
         if gain is not None and self.variance == 'data':
-            background = 0 if error is None else np.square(error, dtype=float)
-            error = np.sqrt(background
+            error = np.sqrt(np.square(error, dtype=float)
                             + np.maximum(data, 0, dtype=float) / gain)
             gain = None
         return engine.kernel_image(data, error, mask, gain)

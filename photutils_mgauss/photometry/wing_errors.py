@@ -27,6 +27,7 @@ from photutils_mgauss.photometry.bright_residual import (
     saturated_rows,
 )
 from photutils_mgauss.photometry.engine import cut_boxes, psf_arrays
+from photutils_mgauss.utils.matrices import with_unit_diagonal
 
 # Correlations are followed to so many pixels along each axis, and adapted so
 # often; more stars than the last are not needed.
@@ -85,11 +86,12 @@ class Wings:
         x and y. None if the stars do not differ, or the fit has no errors.
         """
         weighed = design[free] / variance
-        matrix = weighed @ design[free].T
+        matrix, scale = with_unit_diagonal(weighed @ design[free].T)
         if not (spread > 0).any() or not np.linalg.cond(matrix) < _SINGULAR:
             return None
         shifts = np.zeros(design.shape)
-        shifts[free] = np.linalg.solve(matrix, weighed)
+        shifts[free] = (np.linalg.solve(matrix, weighed / scale[:, None])
+                        / scale[:, None])
         noise = np.sqrt(np.maximum(variance - spread**2, 0))
         return cls(row, column, design, shifts, spread, noise)
 
@@ -142,9 +144,12 @@ class Wings:
     def covariance(self, correlation):
         """Return the covariance (3, 3) of flux, x and y."""
         # Correlations that end somewhere may be none of any pixels.
+        size = np.sqrt((self.shifts**2) @ self.spread**2)
+        shifts = self.shifts / np.where(size > 0, size, 1)[:, None]
         values, vectors = np.linalg.eigh(
-            (self.shifts @ self.matrix(correlation)) @ self.shifts.T)
-        return (vectors * np.maximum(values, 0)) @ vectors.T
+            (shifts @ self.matrix(correlation)) @ shifts.T)
+        return (vectors * np.maximum(values, 0)) @ vectors.T * (
+            size * size[:, None])
 
 
 def _draw(x, y, box, psf):

@@ -503,7 +503,7 @@ def _estimate_noise(values, mask):
     low = seen[seen <= level]
     # Stars only brighten pixels: mirror the faint half.
     noise = mad_std(np.concatenate([low, 2 * level - low]))
-    return noise if noise > 0 else max(seen.std(), 1.0)
+    return noise if noise > 0 else seen.std() or 1.0
 
 
 def photon_slope(data, variance):
