@@ -82,11 +82,11 @@ def _years(column):
     from astropy.time import Time
 
     from photutils_mgauss.files.image_header import any_time
-    from photutils_mgauss.sky.observers import julian_years
+    from photutils_mgauss.sky.observers import ANY_YEAR, julian_years
     if isinstance(column, Time):
-        return julian_years(column)
+        return julian_years(column, within=ANY_YEAR)
     values = getattr(column, 'value', column)
-    return np.array([julian_years(any_time(value, 'tdb'))
+    return np.array([julian_years(any_time(value, 'tdb'), within=ANY_YEAR)
                      for value in np.asarray(values).tolist()], float)
 
 

@@ -51,8 +51,9 @@ class Epoch:
         plane, x in place of right ascension; a column unit of angle or
         ``pixel_scale`` gives them a scale.
     time : `~astropy.time.Time` or float, optional
-        Middle of the exposure; numbers are Julian years (TDB). Required
-        unless the table has a column ``time``.
+        Middle of the exposure; numbers are Julian years (TDB) from
+        1800 to 2200; a date in days needs a Time. Required unless the
+        table has a column ``time``.
     observer : str or `~astropy.coordinates.CartesianRepresentation`, optional
         The place of the observer, for parallaxes: 'earth' (the default),
         'leo', 'l2', or a barycentric position. If this position has a

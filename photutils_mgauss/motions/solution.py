@@ -34,7 +34,7 @@ from photutils_mgauss.motions.tables import (
     star_table,
     used_references,
 )
-from photutils_mgauss.sky.observers import julian_years, tdb
+from photutils_mgauss.sky.observers import ANY_YEAR, julian_years, tdb
 from photutils_mgauss.utils.flags import decode
 from photutils_mgauss.utils.notebook import with_table
 from photutils_mgauss.utils.validation import as_integer
@@ -228,7 +228,8 @@ class MotionSolution:
             the time from the observed epochs, according to the
             correlations.
         """
-        return _stars_at(self._fit, float(julian_years(time)))
+        return _stars_at(self._fit, float(julian_years(
+            time, within=ANY_YEAR)))
 
     def covariance(self, ids):
         """

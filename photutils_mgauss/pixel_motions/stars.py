@@ -78,7 +78,10 @@ def _table_of(stars):
 
 def _years(table, campaign):
     """Return the years positions are given at; the working year if unknown."""
-    years = first_values(table, ['ref_epoch'], u.yr)
+    if 'ref_epoch' not in table.colnames:
+        return np.full(len(table), campaign.working_year)
+    years = np.broadcast_to(julian_years(table['ref_epoch'], 'ref_epoch'),
+                            len(table))
     return np.where(np.isfinite(years), years, campaign.working_year)
 
 

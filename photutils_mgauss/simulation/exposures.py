@@ -37,7 +37,7 @@ from numpy.polynomial import chebyshev, polynomial
 
 from photutils_mgauss.simulation.instrument import Band
 from photutils_mgauss.simulation.mock_psf import band_of
-from photutils_mgauss.sky.observers import add_aberration
+from photutils_mgauss.sky.observers import add_aberration, julian_years
 from photutils_mgauss.sky.tangent_plane import (
     directions,
     local_axes,
@@ -70,13 +70,19 @@ def source_vectors(sources, time):
     radial = unit_vectors(*(_degrees(sources, name) for name in ('ra', 'dec')))
     east, north = local_axes(radial)
     earth = earth_at(time)[0]
-    years = (time.tdb.jyear - _column(sources, 'ref_epoch', u.yr, 2016.0)
+    years = (time.tdb.jyear - _positions_year(sources)
              + earth @ radial * _LIGHT_YEARS)
     moved = radial + years * _MAS * (
         east * _column(sources, 'pmra', u.mas / u.yr)
         + north * _column(sources, 'pmdec', u.mas / u.yr))
     moved -= earth[:, None] * _column(sources, 'parallax', u.mas) * _MAS
     return moved / np.linalg.norm(moved, axis=0)
+
+
+def _positions_year(sources):
+    if 'ref_epoch' not in sources.colnames:
+        return 2016.0
+    return julian_years(sources['ref_epoch'], 'ref_epoch')
 
 
 def _degrees(sources, name):

@@ -21,17 +21,22 @@ LIGHT = 173.1446326846693  # speed of light [au / day]
 # The Sun-Earth L2 point lies this fraction of an Earth orbit further out:
 # the cube root of a third of the Earth-Moon to Sun mass ratio.
 L2_FRACTION = (3.0404e-6 / 3) ** (1 / 3)
-MAX_YEAR = 10_000  # numbers beyond it are days, such as a Julian date
+# Between these years something was observed; other numbers are days, such as
+# a Julian date, or years since something.
+OBSERVED = (1800, 2200)
+ANY_YEAR = (-10_000, 10_000)
 OBSERVERS = ('earth', 'leo', 'l2')
 
 
-def julian_years(time, name='time'):
+def julian_years(time, name='time', *, within=OBSERVED):
     """
     Return times as Julian years in TDB.
 
     Plain numbers are taken to be Julian years already (not decimal years:
     the two differ by up to 0.4 days, and their rates by 2e-4). Words are
-    dates in UTC, such as '2013-05-01T12:00:00'.
+    dates in UTC, such as '2013-05-01T12:00:00'. Times not ``within`` two
+    years are an error, as are quantities that are no years: a length of
+    time, such as 59000 days, is no date.
     """
     time = _read_dates(time)
     if isinstance(time, Time):
@@ -42,7 +47,20 @@ def julian_years(time, name='time'):
             years = np.ma.filled(time.tdb.jyear, np.nan)
     else:
         years = _plain_years(time, name)
-    return np.asarray(years, dtype=float)
+    years = np.asarray(years, dtype=float)
+    # Infinite years are unknown ones, too.
+    years = np.where(np.isfinite(years), years, np.nan)
+    beyond = (years < within[0]) | (years > within[1])
+    if beyond.any():
+        _refuse_time(name, f'the year {years[beyond][0]:.10g}, which is not '
+                     f'between {within[0]} and {within[1]}')
+    return years
+
+
+def _refuse_time(name, got):
+    msg = (f'{name} must be a Time or Julian years, got {got}; give a date '
+           f"in days as Time(..., format='mjd') or format='jd'")
+    raise ValueError(msg)
 
 
 def _read_dates(time):
@@ -63,20 +81,16 @@ def _read_dates(time):
 def _plain_years(time, name):
     unit = getattr(time, 'unit', None)
     if unit is not None:
+        if unit not in ('', u.yr):
+            first = np.ravel(np.ma.getdata(getattr(time, 'value', time)))[:1]
+            _refuse_time(name, ' '.join([*map(str, first), str(unit)]))
         time = np.ma.filled(time, np.nan) if unit == '' else (
-            u.Quantity(time).to_value(u.yr))
+            u.Quantity(time).value)
     try:
-        years = np.ma.filled(np.ma.asarray(time, dtype=float), np.nan)
+        return np.ma.filled(np.ma.asarray(time, dtype=float), np.nan)
     except (TypeError, ValueError) as error:
         msg = f'{name} must be a Time or Julian years, got {time!r:.80}'
         raise TypeError(msg) from error
-    years = np.where(np.isfinite(years), years, np.nan)
-    if (np.abs(years) > MAX_YEAR).any():
-        worst = years[np.abs(years) > MAX_YEAR][0] if years.ndim else years
-        msg = (f'{name} must be a Time or Julian years below {MAX_YEAR}, got '
-               f'{worst}, which looks like a date in days')
-        raise ValueError(msg)
-    return years
 
 
 def tdb(years):

@@ -126,10 +126,17 @@ def test_times_may_come_with_the_rows():
     (lambda: Epoch(table()), ValueError, 'time must be given'),
     (lambda: Epoch(table(), time=np.nan), ValueError, 'time must be finite'),
     (lambda: Epoch(table(), time='soon'), TypeError, 'time must be a Time'),
-    (lambda: Epoch(table(), time=[1.0, 2.0, 3.0]), ValueError,
+    (lambda: Epoch(table(), time=[2021.0, 2022.0, 2023.0]), ValueError,
      'one per row'),
     (lambda: Epoch(table(), time=59215.0), ValueError,
-     r'time must be a Time or Julian years below 10000, got 59215\.0'),
+     'time must be a Time or Julian years, got the year 59215, which'),
+    (lambda: Epoch(table(), time=59000 * u.day), ValueError,
+     r'Julian years, got 59000\.0 d; give a date in days as Time\(..., form'),
+    (lambda: Epoch(table(time=[59000, 59001] * u.day)), ValueError,
+     r'the column time must be a Time or Julian years, got 59000\.0 d;'),
+    (lambda: Epoch(table(), time=Time(59000, format='jd')), ValueError,
+     'got the year -4550'),
+    (lambda: Epoch(table(), time=16.0), ValueError, 'got the year 16, which'),
     (lambda: Epoch(Table({'X': [1.0]}), time=2020.0), ValueError,
      "column 'x_fit' or 'x' or 'ra', got"),
     (lambda: Epoch(table(), 'wcs', 2020.0), TypeError, 'wcs must be'),
@@ -162,6 +169,10 @@ def test_dates_may_be_words(date):
     rows = table()
     rows['time'] = np.full(len(rows), str(date))
     assert_allclose(Epoch(rows, tan_wcs(0, 0)).years, expected)
+
+
+def test_years_may_be_quantities():
+    assert Epoch(table(), time=2013.5 * u.yr).mean_year == 2013.5
 
 
 def test_years_may_be_words():
