@@ -1,5 +1,5 @@
 """From epochs and references to arrays: matched, and on one plane."""
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -83,6 +83,8 @@ class Sightings:
         epochs without pixels, None where nothing depends on them.
     magnitude, colour : (E, n) `~numpy.ndarray` or None
         Of the detections, None where nothing depends on them.
+    left_out : (E,) bool `~numpy.ndarray`
+        Epochs without stars enough for a map, of which nothing is used.
     """
 
     epochs: list
@@ -109,6 +111,17 @@ class Sightings:
     jacobian: np.ndarray | None
     magnitude: np.ndarray | None
     colour: np.ndarray | None
+    left_out: np.ndarray
+
+    def without(self, left_out):
+        """Return the same with epochs (E,) left out."""
+        return replace(self, left_out=left_out,
+                       usable=self.usable & ~left_out[:, None])
+
+    @property
+    def kept(self):
+        """Which epochs (E,) are not left out."""
+        return ~self.left_out
 
     @cached_property
     def epoch_years(self):
@@ -135,7 +148,7 @@ class Sightings:
     @cached_property
     def baseline(self):
         """Years from the first to the last detection or place known."""
-        return whole_baseline(self.years, self.catalogue)
+        return whole_baseline(self.years[self.kept], self.catalogue)
 
     @cached_property
     def typical_variance(self):
@@ -147,7 +160,8 @@ class Sightings:
     @property
     def single(self):
         """Whether all epochs are of one time, but not the references."""
-        own = np.nanmax(self.years) - np.nanmin(self.years)
+        years = self.years[self.kept]
+        own = np.nanmax(years) - np.nanmin(years)
         return bool(own <= period(self.baseline))
 def mean_years(years):
     """Return the mean years (E,) of epochs, from (E, 1) or (E, n)."""
@@ -201,7 +215,8 @@ def assemble(epochs, references, how, transform, wanted=()):
         catalogue=catalogue, references=stars, turns=lists.turns,
         doubts=_not_there(references, stars), notes=notes, chips=lists.chips,
         chip=every.chip, pixels=every.pixels, jacobian=every.jacobian,
-        magnitude=every.magnitude, colour=every.colour)
+        magnitude=every.magnitude, colour=every.colour,
+        left_out=np.zeros(len(epochs), dtype=bool))
 
 
 def _velocities(every, catalogue, stars):

@@ -20,8 +20,9 @@ def correct_epochs(result):
     """
     Return epochs with corrected WCS, and the residuals of those [mas].
 
-    Epochs without a place in the sky, and all if no maps were fitted, stay
-    as they are and have NaN as residual. ``result`` is the `Fit`.
+    Epochs without a place in the sky, those that were left out, and all if
+    no maps were fitted, stay as they are and have NaN as residual.
+    ``result`` is the `Fit`.
     """
     sightings, transform = result.setup.sightings, result.setup.transform
     if sightings.plane is None or transform.kind == 'none':
@@ -30,6 +31,9 @@ def correct_epochs(result):
     sound = result.state.used & ~result.state.untied
     pairs = []
     for e, epoch in enumerate(sightings.epochs):
+        if sightings.left_out[e]:
+            pairs.append((epoch, np.nan))
+            continue
         turn, rows = sightings.turns[e], sightings.matches.rows[e, sound[e]]
         correction = Correction(sightings.plane, transform,
                                 result.state.maps[e], _velocity(epoch, turn),

@@ -179,7 +179,8 @@ class ProperMotionFitter:
         ValueError
             If the epochs have no time baseline, neither with each other
             nor with positions of references, or have no stars in common,
-            or if an epoch has fewer references than its map needs.
+            or if too few epochs have as many references as their maps
+            need. Single epochs with fewer are left out with a warning.
         """
         options = self._options()
         with waiting('ProperMotionFitter.fit'):

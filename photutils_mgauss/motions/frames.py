@@ -110,7 +110,9 @@ def solve_frames(problem, reduced, *, relative=False):
     transform = problem.transform
     n_epochs, size, _ = reduced.direct.shape
     shape = (n_epochs, 2, size // 2)
-    free = np.kron(np.eye(n_epochs), transform.generators)
+    # An epoch of which nothing is used has no map to be found.
+    known = np.einsum('ekk->e', reduced.direct) > 0
+    free = np.kron(np.eye(n_epochs)[:, known], transform.generators)
     matrix, rhs = free.T @ reduced.matrix @ free, free.T @ reduced.rhs
     information = np.einsum('ij,ij->j', free,
                             _blocks_times(reduced.direct, free))

@@ -48,17 +48,20 @@ def paper_setup(setup):
 
 def displacements(setup, state):
     """Return the `Displacements` of the reference objects."""
-    first = int(np.argmin(setup.sightings.epoch_years))
+    kept = setup.sightings.kept
+    first = int(np.argmin(np.where(kept, setup.sightings.epoch_years,
+                                   np.inf)))
     places = np.where(state.used & setup.anchors, setup.sightings.places,
                       np.nan)
     moved = places - places[:, first][:, None]
     count = np.isfinite(moved[0]).sum(axis=1)
-    if (count == 0).any():
-        e = int(np.argmin(count))
+    if (kept & (count == 0)).any():
+        e = int(np.argmin(np.where(kept, count, np.inf)))
         msg = (f'epoch {e} must have reference objects in common with the '
                f'first epoch for the recipe of the paper, got none')
         raise ValueError(msg)
-    mean = np.nanmean(moved, axis=2)
+    count = np.maximum(count, 1)  # None in epochs that are left out.
+    mean = np.nansum(moved, axis=2) / count
     scatter = np.nansum((moved - mean[..., None])**2, axis=2)
     error = np.sqrt(scatter / np.maximum(count - 1, 1) / count)
     return Displacements(mean, error, _mean_motion(setup))
@@ -83,7 +86,8 @@ def fit_paper(setup, state):
     """Return the `Fit` of the paper's recipe."""
     setup = paper_setup(setup)
     found = displacements(setup, state)
-    dt = setup.sightings.epoch_years - setup.sightings.epoch_years.min()
+    years = setup.sightings.epoch_years
+    dt = years - years[setup.sightings.kept].min()
     # Moving the frames along with the references' own mean motion makes the
     # slope a + mean(mu_r) at once.
     shift = np.multiply.outer(found.motion, dt) - found.mean

@@ -1,6 +1,6 @@
 """All that stays the same while a fit of motions iterates, made once."""
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import astropy.units as u
 import numpy as np
@@ -175,13 +175,15 @@ def prepare(sightings, options):
     anchors[stars[catalogue.kinds != 'position']] = True
     anchors[held] = False
     relative = not anchors.any()
+    anchors |= relative
     if relative:
         _check_single(sightings, options)
-        anchors[:] = True
-    working = float(np.nanmean(sightings.epoch_years))
+    sightings, untied = _with_references(sightings, anchors, relative,
+                                         options)
+    if relative and not sightings.kept.all():
+        _check_single(sightings, options)
+    working = float(np.nanmean(sightings.epoch_years[sightings.kept]))
     dt = np.nan_to_num(sightings.years - working)
-    untied = _scattered(sightings, anchors, options.max_motion)
-    _check_references(sightings, anchors, untied, relative, options.transform)
     origin, transform = _field(sightings, options.transform, ~untied)
     drift = _drift(sightings, origin, options)
     nearing, notes = _nearing(sightings, options)
@@ -307,24 +309,43 @@ def _scattered(sightings, anchors, max_motion):
     return (spread > limit) | ~sightings.ties.agreed
 
 
-def _check_references(sightings, anchors, untied, relative, transform):
-    """Raise where an epoch has fewer references than its map needs."""
-    if transform.kind == 'none':
-        return
-    need = transform.n_references
-    usable = sightings.usable & anchors & ~untied
-    if relative:
-        usable = usable & (usable.sum(axis=0) > 1)
-    counts = usable.sum(axis=1)
-    if (counts < need).any():
-        e = int(np.argmin(counts))
+def _with_references(sightings, anchors, relative, options):
+    """
+    Return sightings and scattered stars (n,) without epochs of no use.
+
+    Those have fewer references than their map needs. One after another is
+    left out, the worst first: what stars have in common changes with each.
+    Raises where nothing would be left.
+    """
+    while True:
+        untied = _scattered(sightings, anchors, options.max_motion)
+        counts = _count_references(sightings, anchors & ~untied, relative)
+        few = sightings.kept & (counts < options.transform.n_references)
+        if options.transform.kind == 'none' or not few.any():
+            return sightings, untied
+        e = int(np.argmin(np.where(few, counts, np.inf)))
         what = ('stars in common with other epochs' if relative
                 else 'reference objects')
         if (untied & anchors).any():
             what += ' whose places agree'
-        msg = (f'epoch {e} must have at least {need} {what} for the '
-               f'transform {transform.kind!r}, got {counts[e]}')
-        raise ValueError(msg)
+        rule = (f'must have at least {options.transform.n_references} '
+                f'{what} for the transform {options.transform.kind!r}, got '
+                f'{counts[e]}')
+        left_out = ~sightings.kept
+        left_out[e] = True
+        if left_out.all() or not sightings.without(left_out).baseline > 0:
+            msg = f'epoch {e} {rule}'
+            raise ValueError(msg)
+        said = (*sightings.doubts, f'Epoch {e} was left out: it {rule}.')
+        sightings = replace(sightings.without(left_out), doubts=said)
+
+
+def _count_references(sightings, anchors, relative):
+    """Return how many usable anchors (n,) the epochs have, (E,)."""
+    usable = sightings.usable & anchors
+    if relative:
+        usable = usable & (usable.sum(axis=0) > 1)
+    return usable.sum(axis=1)
 
 
 def _field(sightings, transform, sound):
@@ -333,9 +354,10 @@ def _field(sightings, transform, sound):
 
     The coordinates suit the stars whose places are ``sound`` (n,), if any.
     """
-    count = np.isfinite(sightings.places[0]).sum(axis=0)
+    places = sightings.places[:, sightings.kept]
+    count = np.isfinite(places[0]).sum(axis=0)
     with np.errstate(invalid='ignore'):
-        origin = (np.nansum(sightings.places, axis=1)
+        origin = (np.nansum(places, axis=1)
                   / np.where(count, count, np.nan))
     inside = np.where(sound | ~sound.any(), origin, np.nan)
     transform = transform.fitted_to(inside)

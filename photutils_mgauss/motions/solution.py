@@ -114,7 +114,9 @@ class MotionSolution:
     alignment : `~astropy.table.QTable`
         One row per epoch: the map's shift and matrix, its coefficients,
         the references used and rejected, the rms of their residuals, and
-        the systematic error found.
+        the systematic error found. ``left_out`` marks epochs with fewer
+        references, or stars in common, than a map needs, which are not
+        used; their maps are NaN, and the fit warns of them.
     notes : tuple of str
         Sentences about signs of wrong references (the fit also warns of
         these) or wrong errors, quantities that the data could not

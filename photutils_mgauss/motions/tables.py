@@ -256,7 +256,8 @@ def _flags(fit):
     relative = fit.setup.relative and fit.setup.transform.kind != 'none'
     marks = {
         1: ~solved,
-        2: (finite & ~sightings.usable).any(axis=0),
+        2: (finite & ~sightings.usable & sightings.kept[:, None]).any(
+            axis=0),
         4: (seen & ~finite).any(axis=0),
         8: (sightings.usable & ~state.used).any(axis=0),
         16: sightings.matches.ambiguous,
@@ -350,7 +351,8 @@ def alignment_table(fit, wcs_residuals):
     unit = u.Unit(sightings.unit)
     centre = np.array(transform.centre)[:, None]
     shift, slope, errors = [], [], []
-    for e, coefficients in enumerate(state.maps):
+    maps = _known_maps(fit)
+    for e, coefficients in enumerate(maps):
         shift.append(_whole_shift(transform, coefficients, centre,
                                   sightings.ties.maps[e]))
         slope.append(_whole_slope(transform, coefficients, centre,
@@ -363,14 +365,16 @@ def alignment_table(fit, wcs_residuals):
     table['shift'] = np.array(shift) * unit
     table['shift_error'] = np.array(errors) * unit
     table['matrix'] = np.array(slope)
-    table['coefficients'] = state.maps * unit
+    table['coefficients'] = maps * unit
     for name, values in counts.items():
         table[name] = values
     floor = np.broadcast_to(state.floor.T, (2, len(state.maps))).T
+    floor = np.where(sightings.left_out[:, None], np.nan, floor)
     table['systematic'] = np.sqrt(floor) * unit
     if state.scales is not None:
         _add_scales(table, fit)
     table['wcs_residual'] = np.array(wcs_residuals) * u.mas
+    table['left_out'] = sightings.left_out
     table.meta.update(kind=transform.kind, degree=transform.degree,
                       xcentre=transform.centre[0],
                       ycentre=transform.centre[1], scale=transform.scale)
@@ -437,6 +441,12 @@ def _add_scales(table, fit):
     table['error_floor'] = np.sqrt(added) * table['systematic'].unit
 
 
+def _known_maps(fit):
+    """Return the maps (E, 2, b), NaN for epochs that were left out."""
+    return np.where(fit.setup.sightings.left_out[:, None, None], np.nan,
+                    fit.state.maps)
+
+
 def _whole_shift(transform, coefficients, centre, tie):
     """Return the shift at the centre, or for a tied plane that of (0, 0)."""
     if tie is not None:
@@ -452,6 +462,8 @@ def _whole_slope(transform, coefficients, centre, tie):
 def _shift_errors(fit, e):
     """Return the errors of a map's shift at the centre of the field."""
     b = fit.setup.transform.n_terms
+    if fit.setup.sightings.left_out[e]:
+        return np.full(2, np.nan)
     covariance = fit.frames.covariance(e)
     return np.sqrt(np.diag(covariance)[[0, b]])
 
@@ -484,6 +496,7 @@ def residual_table(fit):
     years = np.broadcast_to(sightings.years, finite.shape)[at]
     table['time'] = years * u.yr
     _add_aligned(table, fit, at, unit)
+    finite &= sightings.kept[:, None]
     residual = np.where(finite, full.residuals, np.nan)
     left_out = _leave_one_out(full, covariance)
     for k, name in enumerate(('dra', 'ddec')):
@@ -499,7 +512,7 @@ def _add_aligned(table, fit, at, unit):
     setup, sightings = fit.setup, fit.setup.sightings
     places = setup.undistorted(fit.state)
     aligned = np.stack([setup.transform.apply(one, places[:, e])
-                        for e, one in enumerate(fit.state.maps)], axis=1)
+                        for e, one in enumerate(_known_maps(fit))], axis=1)
     if sightings.plane is not None:
         ra, dec = directions(sightings.plane.deproject(aligned))
         table['ra'], table['dec'] = ra[at] * u.deg, dec[at] * u.deg

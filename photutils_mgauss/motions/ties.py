@@ -51,16 +51,22 @@ def tie_planes(detections, years, catalogue, stars, on_sky, transform):
     targets = np.full(places[:, 0].shape, np.nan)
     targets[:, stars] = catalogue.values[:2]
     known = np.isfinite(targets[0]).sum() >= 3
+    need, usable = transform.n_references, detections.usable
     if not known:
-        targets = _mean_places(places[:, on_sky if on_sky.any() else [0]])
+        first = int(np.argmax(usable.sum(axis=1) >= need))
+        targets = _mean_places(places[:, on_sky if on_sky.any() else [first]])
     for e in np.flatnonzero(~on_sky):
         if known:
             targets[:, stars] = (catalogue.values[:2] + np.nan_to_num(
                 catalogue.motion()) * np.nan_to_num(years[e]
                                                     - catalogue.year))
+        common = usable[e] & np.isfinite(targets).all(axis=0)
+        if common.sum() < need:
+            # Where it is on the common plane nobody knows.
+            usable[e], maps[e] = False, np.eye(2, 3, 1)
+            continue
         maps[e], far = tie_points(places[:, e], targets,
-                                  detections.usable[e], transform,
-                                  f'epoch {e}')
+                                  usable[e], transform, f'epoch {e}')
         agreed &= ~far
         slope = maps[e][:, 1:]
         places[:, e] = maps[e][:, :1] + slope @ places[:, e]

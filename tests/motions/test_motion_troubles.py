@@ -46,8 +46,8 @@ def test_too_few_references_raise(rng, transform, n):
     marked = [changed(epoch, qso=np.arange(40) < max(n, 1))
               for epoch in epochs]
     if n == 0:
-        marked[1] = changed(marked[1], x_err=np.where(
-            marked[1].table['qso'], np.nan, 0.01))
+        marked = [changed(one, x_err=np.where(one.table['qso'], np.nan, 0.01))
+                  for one in marked]
     with pytest.raises(ValueError, match=f'got {n}$'):
         ProperMotionFitter(transform=transform, references='qso').fit(marked)
 
@@ -143,11 +143,56 @@ def test_parallaxes_need_a_sky(rng):
         ProperMotionFitter(parallax=True).fit(epochs)
 
 
+def useless(epoch, kind):
+    """Return an epoch of which nothing can be used, of some kind."""
+    if kind == 'nowhere':
+        nothing = np.full(len(epoch.table), np.nan)
+        return changed(epoch, x_fit=nothing)
+    return Epoch(epoch.table[:2 if kind == 'few' else 0], epoch.wcs,
+                 epoch.time)
+
+
+@pytest.mark.parametrize('kind', ['nowhere', 'few', 'empty'])
+@pytest.mark.parametrize(('references', 'recipe'), [
+    ('qso', 'joint'), (None, 'joint'), ('qso', 'paper')])
+def test_an_epoch_of_no_use_is_left_out(rng, kind, references, recipe):
+    one, two, three = observe(make_truth(rng, n_stars=50, n_qso=50), rng,
+                              missing=0.0)[:3]
+    fitter = ProperMotionFitter(references=references, recipe=recipe)
+    alone = fitter.fit([one, three])
+    with pytest.warns(UserWarning, match='Epoch 1 was left out: it must'):
+        fit = fitter.fit([one, useless(two, kind), three])
+    used = fit.stars[fit.stars['n_good_obs'] > 0]
+    for name in ('ra', 'pmra', 'pmdec_error', 'ref_epoch'):
+        # The plane touches the sky at the middle of all that was given.
+        assert_allclose(used[name].value, alone.stars[name].value,
+                        rtol=1e-5, atol=1e-5)
+    assert list(fit.alignment['left_out']) == [False, True, False]
+    for name in ('shift', 'shift_error', 'matrix', 'rms', 'systematic'):
+        assert np.isnan(fit.alignment[name][1]).all()
+        assert np.isfinite(fit.alignment[name][::2]).all()
+    assert fit.epochs[1].wcs is two.wcs
+    rows = fit.residuals[fit.residuals['epoch'] == 1]
+    assert not rows['used'].any()
+    assert np.isnan(rows['dra'].value).all()
+
+
+@pytest.mark.parametrize('which', [0, 2])
+def test_a_plane_of_no_use_is_left_out(rng, which):
+    epochs, _ = plane_epochs(rng)
+    alone = ProperMotionFitter().fit(
+        [epoch for e, epoch in enumerate(epochs) if e != which])
+    epochs[which] = useless(epochs[which], 'nowhere')
+    with pytest.warns(UserWarning, match=f'Epoch {which} was left out'):
+        fit = ProperMotionFitter().fit(epochs)
+    assert_allclose(fit.stars['pmra'].value, alone.stars['pmra'].value)
+
+
 def test_an_epoch_without_stars_lacks_references(rng):
-    epochs = observe(make_truth(rng, n_stars=50, n_qso=50), rng)[:3]
-    empty = Epoch(epochs[2].table[:0], epochs[2].wcs, epochs[2].time)
-    with pytest.raises(ValueError, match='epoch 2 must have at least 3 '):
-        ProperMotionFitter(references='qso').fit([*epochs[:2], empty])
+    epochs = observe(make_truth(rng, n_stars=50, n_qso=50), rng)[:2]
+    with pytest.raises(ValueError, match='epoch 1 must have at least 3 '):
+        ProperMotionFitter(references='qso').fit(
+            [epochs[0], useless(epochs[1], 'few')])
 
 
 @pytest.mark.parametrize(('keywords', 'kind', 'words'), [
