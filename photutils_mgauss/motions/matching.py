@@ -297,7 +297,9 @@ def _known(catalogue, year):
                     for some in (variance[:2], variance[2:4]))
     return Known(catalogue.values[:2], catalogue.motion(),
                  np.nan_to_num(catalogue.year, nan=year), sigma,
-                 np.where(catalogue.fixed, 0.0, drift))
+                 np.where(catalogue.fixed, 0.0, drift),
+                 np.where(catalogue.fixed, 0.0, np.maximum(np.nan_to_num(
+                     catalogue.values[4]), 0.0)))
 
 
 def _names_of_catalogue(ids, n):

@@ -17,6 +17,12 @@ from photutils_mgauss.utils.robust import std_about_zero
 # Field stars that tie one exposure to the next one before it is matched.
 SAMPLE = 20000
 N_SIGMA = 5.0
+# Motions of a catalogue that tell how likely others are, and how many of them
+# are next to one that is looked for.
+ENOUGH, NEXT = 50, 5
+# Part of the motions of catalogues that are wrong by more than their errors.
+WRONG = 1e-3
+DOUBTFUL = 0.01  # chance of a pair of unrelated objects that is flagged
 # Of the polynomials that bend a chip onto known stars, one after another.
 DEGREES = (1, 1, 2, 3, 3, 3)
 
@@ -31,7 +37,8 @@ class Matches:
     rows : (E, n) int `~numpy.ndarray`
         Row of each star in the table of each exposure, -1 where missing.
     ambiguous : (n,) bool `~numpy.ndarray`
-        Whether another pairing lay within the tolerance too.
+        Whether another pairing lay within the tolerance too, or the row may
+        be an unrelated one.
     """
 
     rows: np.ndarray
@@ -69,7 +76,8 @@ class Known(NamedTuple):
     Stars known beforehand: places and motions (2, n) at Julian years (n,).
 
     Motions are NaN where they are not known. ``sigma`` and ``drift`` (n,)
-    are the standard errors of the places and, per year, of the motions.
+    are the standard errors of the places and, per year, of the motions,
+    ``parallax`` (n,) how far parallaxes may take them from there.
     """
 
     position: np.ndarray
@@ -77,6 +85,7 @@ class Known(NamedTuple):
     year: np.ndarray
     sigma: np.ndarray | float = 0.0
     drift: np.ndarray | float = 0.0
+    parallax: np.ndarray | float = 0.0
 
 
 @dataclass(eq=False)
@@ -89,6 +98,7 @@ class _Master:
     motion: np.ndarray     # (2, n), 0 where unknown
     known: np.ndarray      # (n,) whether the motion is known
     drift: np.ndarray      # (n,) standard error of the motion
+    parallax: np.ndarray   # (n,) 0 where unknown
     ambiguous: np.ndarray  # (n,)
 
     def at(self, year):
@@ -107,6 +117,7 @@ class _Master:
         self.motion = np.hstack([self.motion, np.zeros((2, n))])
         self.known = np.append(self.known, np.zeros(n, dtype=bool))
         self.drift = np.append(self.drift, np.zeros(n))
+        self.parallax = np.append(self.parallax, np.zeros(n))
         self.ambiguous = np.append(self.ambiguous, np.zeros(n, dtype=bool))
 
 
@@ -144,7 +155,8 @@ class Tolerance:
             master.known[stars] & (not doubt),
             N_SIGMA * master.drift[stars], self.max_motion)
         error = N_SIGMA * np.hypot(sigma, master.sigma[stars])
-        return error + motion + slack
+        # From one end of its ellipse to the other.
+        return error + motion + slack + 2 * master.parallax[stars]
 
 
 def match_positions(places, sigmas, years, tolerance, catalogue=None,
@@ -187,13 +199,14 @@ def match_positions(places, sigmas, years, tolerance, catalogue=None,
 def _start(catalogue):
     if catalogue is None:
         catalogue = np.empty((2, 0)), np.empty((2, 0)), np.empty(0)
-    position, motion, year, sigma, drift = Known(*catalogue)
+    position, motion, year, sigma, drift, parallax = Known(*catalogue)
     n = position.shape[1]
     known = np.isfinite(motion).all(axis=0)
-    sigma, drift = np.zeros(n) + sigma, np.zeros(n) + drift
+    sigma, drift, parallax = (np.zeros(n) + one
+                              for one in (sigma, drift, parallax))
     return _Master(position.copy(), sigma, np.array(year, dtype=float),
                    np.where(known, motion, 0.0), known, drift,
-                   np.zeros(n, dtype=bool))
+                   parallax, np.zeros(n, dtype=bool))
 
 
 def _match_one(master, places, sigma, year, tolerance, chip):
@@ -232,6 +245,13 @@ def _pair(master, tree, known, places, sigma, year, tolerance, slack):
     inside = (first >= 0) & (distance[:, 0] <= limit)
     doubt = inside & (second >= 0) & (distance[:, 1] <= limit2)
     stars = np.where(inside, first, -1)
+    area = max(np.prod(np.ptp(places, axis=1)), 1e-300)
+    chance = _chance(master, stars, places, sigma, year, slack,
+                     np.sum(~inside) / area)
+    stars[chance > 0.5] = -1
+    inside &= stars >= 0
+    doubt &= inside
+    doubt |= inside & (chance > DOUBTFUL)
     # Nearest first: of several rows that claim one star, one may have it.
     rows = np.flatnonzero(inside)
     rows = rows[np.argsort(distance[rows, 0], kind='stable')]
@@ -247,18 +267,47 @@ def _pair(master, tree, known, places, sigma, year, tolerance, slack):
     free = known[~taken[known]]
     if len(rows) and len(free):
         stars[rows] = _pair_left(master, free, places[:, rows], sigma[rows],
-                                 year, tolerance, slack)
+                                 year, tolerance, slack, area)
         master.ambiguous[stars[rows][stars[rows] >= 0]] = True
     return stars
 
 
-def _pair_left(master, free, places, sigma, year, tolerance, slack):
+def _chance(master, stars, places, sigma, year, slack, unrelated):
+    """
+    Return how probable it is that rows (n,) are not the stars next to them.
+
+    Where motions are not known, those of the catalogue say how likely the
+    displacement is. ``unrelated`` is the density of rows without a star.
+    """
+    chance = np.zeros(len(stars))
+    which = np.flatnonzero((stars >= 0) & ~master.known[stars])
+    motions = master.motion[:, master.motion.any(axis=0)].T
+    if not len(which) or len(motions) < ENOUGH:
+        return chance
+    star = stars[which]
+    # Hardly any time makes any motion a likely one.
+    years = np.maximum(np.abs(year - master.year[star]), 1e-9)
+    moved = places[:, which] - master.position[:, star]
+    moved *= np.where(year < master.year[star], -1, 1) / years
+    error = N_SIGMA * np.hypot(sigma[which], master.sigma[star]) + slack
+    tree = cKDTree(motions)
+    reach = np.maximum(tree.query(moved.T, k=NEXT)[0][:, -1], error / years)
+    count = tree.query_ball_point(moved.T, reach * (1 + 1e-9),
+                                  return_length=True)
+    likely = count / (len(motions) * np.pi * (reach * years)**2)
+    chance[which] = unrelated / (unrelated + likely)
+    return chance
+
+
+def _pair_left(master, free, places, sigma, year, tolerance, slack, area):
     """
     Return for rows that are left the star that is left for them, or -1.
 
     A fast star is not the one nearest to where it was; but it is paired only
     where no other row and no other star is within the tolerance. Nor is a
-    star whose catalogue has a wrong motion near where that leads.
+    star whose catalogue has a wrong motion near where that leads. Neither is
+    paired where a row is rather one of the others that have no star, of
+    which there are some in an ``area``.
     """
     between = partial(tolerance.between, master, year=year, slack=slack,
                       doubt=True)
@@ -270,6 +319,12 @@ def _pair_left(master, free, places, sigma, year, tolerance, slack):
               & (distance[:, k] <= between(star[:, k], sigma))
               for k in range(2)]
     found = np.where(inside[0] & ~inside[1], star[:, 0], -1)
+    unrelated = (places.shape[1] - 1) / area
+    chance = _chance(master, found, places, sigma, year, slack, unrelated)
+    wrong = WRONG / (np.pi * np.maximum(between(found, sigma), 1e-300)**2)
+    chance = np.where(master.known[found], unrelated / (unrelated + wrong),
+                      chance)
+    found[chance > 0.5] = -1
     wanted, counts = np.unique(star[:, 0][inside[0]], return_counts=True)
     return np.where(np.isin(found, wanted[counts == 1]), found, -1)
 

@@ -27,7 +27,7 @@ FLAGS = {
         'outside the bounding box of the WCS; it is left out'),
     8: 'outlier: a detection was rejected as an outlier',
     16: ('ambiguous: another pairing of detections lay within the tolerance '
-         'of the match'),
+         'of the match, or an unrelated detection may lie there by chance'),
     32: ('reference_rejected: a reference object whose catalogue values the '
          'data contradict; it was treated as any other star'),
     64: 'held_out: a reference object kept back for validation',

@@ -5,6 +5,7 @@ from numpy.testing import assert_array_equal
 from scipy.spatial.distance import cdist
 
 from photutils_mgauss.motions.matching import (
+    Known,
     Tolerance,
     match_ids,
     match_positions,
@@ -148,3 +149,19 @@ def test_two_that_are_left_over_are_not_guessed(rng):
                               Tolerance(None, 1500.0, 2000.0))
     together = (matches.rows >= 0).all(axis=0)
     assert not together[matches.rows[1] == 0].any()
+
+
+def test_a_known_parallax_moves_a_star(rng):
+    # The star is 80 mas from where it was, and others are farther away.
+    n = 100
+    place = rng.uniform(0, 1e5, (2, n))
+    row = place + rng.normal(0, 0.1, (2, n))
+    row[0, 0] += 80
+    row = np.column_stack([row, rng.uniform(0, 1e5, (2, 4000))])
+    parallax = np.zeros(n)
+    parallax[0] = 100.0
+    known = Known(place, rng.normal(0, 1e-3, (2, n)), np.full(n, 2016.0),
+                  0.1, 0.01, parallax)
+    matches = match_positions([row], [np.full(row.shape[1], 0.1)], [2012.0],
+                              FREE, known)
+    assert_array_equal(matches.rows[0, :n], np.arange(n))

@@ -1,4 +1,5 @@
 """One exposure, or many of one night, and a catalogue with places."""
+import astropy.units as u
 import numpy as np
 import pytest
 from astropy.table import Table
@@ -30,6 +31,33 @@ def test_the_pulls_of_one_epoch_and_a_catalogue(scene):
         assert pull.shape[1] > 0.98 * which.sum()
         assert abs(rms(pull) - 1) < 0.05 + 1 / np.sqrt(2 * pull.size)
     assert solution.notes == ()
+
+
+@pytest.mark.parametrize('max_motion', [50, 500])
+def test_a_deeper_list_makes_no_wrong_pairs(rng, max_motion):
+    # The catalogue has half of the stars, the exposure nine in ten of all.
+    sky = make_sky(rng, n=3000, half_width=60)
+    stars = np.arange(3000)
+    known = stars < 1500
+    seen = rng.uniform(size=3000) < 0.9
+    epoch = observe_once(sky, rng, which=seen)
+    solution = ProperMotionFitter(
+        references=gaia_table(sky, rng)[known],
+        max_motion=max_motion * u.mas / u.yr).fit([epoch])
+    table = solution.stars
+    rows = solution._fit.setup.sightings.matches.rows[0]
+    true = np.where(rows >= 0, epoch.table['number'][rows], -1)
+    row = np.asarray(table['reference_row'])
+    both = (row >= 0) & (rows >= 0)
+    wrong = both & (row != true)
+    with_motion = sky.bright & (stars < 1500)
+    # Of the stars with a motion in the catalogue none, flagged or not.
+    assert not wrong[with_motion[row]].any()
+    assert not (wrong & (table['flags'] & 16 == 0)).any()
+    assert both.sum() > 0.99 * (known & seen).sum()
+    for which in (with_motion, known & ~sky.bright):
+        pull = pulls(table, sky, which)
+        assert abs(rms(pull) - 1) < 0.05 + 1 / np.sqrt(2 * pull.size)
 
 
 def test_it_equals_two_epochs_of_which_the_catalogue_is_one(scene):
