@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from astropy.utils.exceptions import AstropyUserWarning
 
+from photutils_mgauss.crowded.alignment import tell_of_misplaced
 from photutils_mgauss.crowded.correlated import allow_in_each
 from photutils_mgauss.crowded.many_equations import FARTHEST, reach_of
 from photutils_mgauss.crowded.many_plan import ManyPlan
@@ -65,8 +66,11 @@ def fit_images(images, listed, settings, *, motions):
         given = Stars(u, v, np.zeros(u.size), number=np.arange(u.size),
                       bound=settings.bound)
     each = [settings.options_of(one) for one in field.pixels]
+    models = [settings.model_of(pixels) if psf is None else psf
+              for psf, pixels in zip(field.psfs, field.pixels, strict=True)]
+    tell_of_misplaced(field, models, motions=motions)
     plan = ManyPlan(
-        field.pixels, list(_psfs(settings, field)),
+        field.pixels, _local(models),
         # What is known of fluxes and places is said once for all images.
         [replace(one, count_slope=0.0) for one in each],
         replace(each[0], gain=None), field.grid,
@@ -95,16 +99,11 @@ def _bands(field, motions):
     return np.unique(field.bands, return_inverse=True)[1]
 
 
-def _psfs(settings, field):
+def _local(models):
     """Return the PSF of each image, made once where images have the same."""
-    made = {}
-    for psf, pixels in zip(field.psfs, field.pixels, strict=True):
-        if psf is None:
-            yield LocalPSF.of(settings.model_of(pixels))
-        else:
-            if id(psf) not in made:
-                made[id(psf)] = LocalPSF.of(psf)
-            yield made[id(psf)]
+    made = {id(model): LocalPSF.of(model)
+            for model in {id(model): model for model in models}.values()}
+    return [made[id(model)] for model in models]
 
 
 def _table(plan, outcomes, field):

@@ -122,8 +122,12 @@ class PixelGrid:
         shape = tuple(int(n) for n in np.ceil(high - low)[::-1] + 1)
         if not np.prod(shape, dtype=float) < _GROWTH * max(
                 map(np.prod, shapes)):
+            middles = np.array([plane.project(one).mean(axis=1)
+                                for one in corners])
+            away = np.hypot(*(middles - np.median(middles, axis=0)).T)
             msg = ('images must lie on each other to be fitted together, got '
-                   f'fields that need {shape[1]} x {shape[0]} pixels')
+                   f'fields that need {shape[1]} x {shape[0]} pixels; image '
+                   f'{np.argmax(away)} is the farthest from the others')
             raise ValueError(msg)
         return cls(plane, matrix @ low, matrix, shape, [], [])._mapped(
             frames, shapes)

@@ -1,4 +1,5 @@
 """Many images of one crowded field: one list, places in common."""
+import re
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
@@ -19,9 +20,11 @@ from photutils_mgauss import (
     ImageEpoch,
     decode_psf_flags,
 )
+from photutils_mgauss.crowded.alignment import tell_of_misplaced
 from photutils_mgauss.crowded.many_tile import ManyJob, ManyTile, TileMap
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.crowded.tile import TileJob, TileOptions
+from photutils_mgauss.photometry.many_images import read_field
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.sky.pixel_grid import PixelGrid
 
@@ -83,6 +86,57 @@ def field():
     colour = 10**rng.normal(-0.2, 0.15, n)
     fluxes = np.array([flux, flux, flux * colour, flux * colour])
     return expose(sky, fluxes, 9), sky, fluxes
+
+
+def shifted(images, k, step):
+    """Return the images, the WCS of one shifted by pixels."""
+    data, psf, wcs = images[k]
+    wcs = wcs.deepcopy()
+    wcs.wcs.crpix += step
+    return [*images[:k], (data, psf, wcs), *images[k + 1:]]
+
+
+@pytest.mark.parametrize(('wrong', 'step'), [
+    (0, [0.4, 0.3]), (2, [0.4, 0.3]), (1, [-4.0, 3.0])])
+def test_an_image_whose_wcs_is_off_is_told(field, wrong, step):
+    images = shifted(field[0], wrong, step)
+    there = read_field(images)
+    length = np.hypot(*step)
+    with pytest.warns(UserWarning,
+                      match=f'stars of image {wrong} lie') as told:
+        tell_of_misplaced(there, there.psfs, motions=False)
+    found = float(re.search(r'lie (\d\.\d\d) pixels',
+                            str(told[0].message))[1])
+    assert abs(found - length) < 0.1
+
+
+def test_two_images_beside_each_other_are_told(field):
+    images = shifted(field[0], 1, [0.3, 0.0])[:2]
+    with pytest.warns(UserWarning, match='images 0 and 1 lie 0.3'):
+        CrowdedMixturePhotometry(None, maxiters=1).fit_images(images)
+
+
+def test_stars_that_move_together_are_not_images_that_are_off(field):
+    images = [ImageEpoch(data, psf, wcs, 2020.0 + k) for k, (
+        data, psf, wcs) in enumerate(field[0])]
+    for k, image in enumerate(images):
+        # The images have other axes and scales: on the sky, not in pixels.
+        wcs = image.wcs.deepcopy()
+        wcs.wcs.crval += [0.0, 6e-6 * k]
+        images[k] = ImageEpoch(image.data, image.psf, wcs, image.time)
+    there = read_field(images)
+    tell_of_misplaced(there, there.psfs, motions=True)
+    with pytest.warns(UserWarning, match='motions=True if the stars move'):
+        tell_of_misplaced(there, there.psfs, motions=False)
+
+
+def test_right_images_and_images_of_nothing_are_not_told(field):
+    there = read_field(field[0])
+    tell_of_misplaced(there, there.psfs, motions=False)
+    noise = np.random.default_rng(1).normal(size=(100, 100))
+    there = read_field([(NDData(noise, StdDevUncertainty(np.ones((100, 100)))),
+                         PSFS[0], one) for one in WCS_OF])
+    tell_of_misplaced(there, there.psfs, motions=False)
 
 
 @pytest.fixture(scope='module')
