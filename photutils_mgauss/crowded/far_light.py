@@ -129,13 +129,10 @@ def _equations(residual, variance, light, stars, edges, spacing):
 
 
 def _without_units(terms, total):
-    """Bring the sky to the size of the light of stars, in place."""
-    # What of the sky is small beside it must not depend on the unit.
-    size = np.sqrt((terms**2) @ total)
-    n = SLOPES.size + _N_RINGS
-    light, sky = size[:n].max(initial=0), size[n:].max(initial=0)
-    if light > 0 and sky > 0:
-        terms[n:] *= light / sky
+    """Bring the sky to units of the noise of a pixel, in place."""
+    # What the pixels do not tell of it must not depend on the unit.
+    if total.size:
+        terms[SLOPES.size + _N_RINGS:] *= _BLOCK / np.sqrt(np.median(total))
 
 
 def _solve(matrix, right):
