@@ -38,6 +38,7 @@ from photutils_mgauss.motions.posing import (
 from photutils_mgauss.motions.prepare import Setup, State
 from photutils_mgauss.motions.priors import weak_priors
 from photutils_mgauss.motions.relative import remove_mean_fields
+from photutils_mgauss.motions.second_look import MOST, fewest_rejections
 from photutils_mgauss.motions.stacked import (
     dimensions_2x2,
     invert_2x2,
@@ -207,6 +208,10 @@ def fit(setup, state):
     if setup.terms is not None:
         setup, state = _with_terms(setup, state)
     problem, frames, state, kept = _cleaned(setup, state)
+    after = _looked_again(setup, state, frames)
+    if after is not state:
+        problem = None
+        problem, frames, state, kept = _align(setup, after)
     rounds = 12 if setup.options.scales_errors else 4
     for i in range(rounds * setup.options.fits_floor):
         after = _systematics(setup, state, problem, frames, anew=i == 0)
@@ -252,6 +257,33 @@ def _cleaned(setup, state):
     else:
         kept, state = None, replace(state, unfinished=True)
     return problem, frames, state, kept
+
+
+def _looked_again(setup, state, frames):
+    """
+    Return the state with the fewest detections rejected.
+
+    Where several choices are as good, the star is not to be trusted.
+    """
+    usable, clip = setup.sightings.usable, setup.options.clip
+    stars = np.flatnonzero((usable & ~state.used).any(axis=0)
+                           & ~state.crooked)
+    if clip is None or not len(stars) or setup.sightings.kept.sum() > MOST:
+        return state
+    used, untied = state.used.copy(), state.untied.copy()
+    used[:, stars] = usable[:, stars]
+    problem = pose(setup, replace(state.posed, used=used)).select(stars)
+    bad, found, single = fewest_rejections(problem, clip, partial(
+        _solve_in, setup, frames))
+    used[:, stars] = np.where(found, used[:, stars] & ~bad,
+                              state.used[:, stars])
+    doubtful = stars[found & ~single]
+    untied[doubtful] |= ~setup.anchors[doubtful] | setup.relative
+    return replace(state, used=used, untied=untied)
+
+
+def _solve_in(setup, frames, problem, **wanted):
+    return solve(setup, problem, frames, **wanted)
 
 
 def fitted_terms(result):

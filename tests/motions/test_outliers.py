@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from helpers.motion_scenes import make_truth, observe
+from helpers.motion_scenes import changed, make_truth, observe, plane_epochs
 from photutils_mgauss import ProperMotionFitter
 from photutils_mgauss.motions.assemble import assemble
 from photutils_mgauss.motions.frames import solve_frames
@@ -76,3 +76,25 @@ def test_leverages_of_a_star_add_up_to_its_parameters(rng):
     alone = problem.unbound
     solved = (alone.weights[0] > 0).sum(axis=0) > 2
     assert_allclose(leverages(alone).sum(axis=0)[solved], 4)
+
+
+def test_two_bad_detections_of_a_star_cost_no_good_one(rng):
+    # The worst of what is left would often be a good one.
+    n = 300
+    epochs, _ = plane_epochs(rng, n=n, years=2020 + np.arange(7.0))
+    bad = np.zeros((7, n), dtype=bool)
+    for star in range(0, n, 3):
+        bad[rng.choice(7, 2, replace=False), star] = True
+    angle = rng.uniform(0, 2 * np.pi, (7, n))
+    moved = [changed(epoch,
+                     x_fit=epoch.table['x_fit'] + 0.2 * bad[e] * np.cos(
+                         angle[e]),
+                     y_fit=epoch.table['y_fit'] + 0.2 * bad[e] * np.sin(
+                         angle[e])) for e, epoch in enumerate(epochs)]
+    solution = ProperMotionFitter(systematic=None).fit(moved)
+    residuals = solution.residuals
+    used = np.zeros((7, n), dtype=bool)
+    used[residuals['epoch'], residuals['id']] = residuals['used']
+    certain = solution.stars['flags'] & 512 == 0
+    assert certain.mean() > 0.95
+    assert (used == ~bad)[:, certain].all()
