@@ -116,6 +116,8 @@ def read_epochs(epochs, references=None, *, by_pattern=False, wanted=()):
         vectors = [vector if turn is None else turn @ vector
                    for vector, turn in zip(vectors, turns, strict=True)]
     plane = _common_plane(vectors)
+    if plane is None and by_pattern:
+        plane = _plane_of_references(references)
     unit = 'mas' if plane else _common_unit(epochs, references)
     chips = list(dict.fromkeys(name for epoch in epochs
                                for name in epoch.chips or ()))
@@ -149,6 +151,14 @@ def _common_plane(vectors):
                'bounding boxes of their WCS')
         raise ValueError(msg)
     return TangentPlane.around(total)
+
+
+def _plane_of_references(references):
+    """Return the plane of references on the sky, None if there are none."""
+    if references is None or 'ra' not in references.colnames:
+        return None
+    total = np.nansum(table_vectors(references), axis=1)
+    return TangentPlane.around(total) if total.any() else None
 
 
 def _common_unit(epochs, references):

@@ -43,7 +43,8 @@ class ProperMotionFitter:
         ``transform`` is, and which fits no parallaxes.
     references : `~astropy.table.Table`, sequence or str, optional
         Objects whose motions are known. A table with ``id`` or ``ra`` and
-        ``dec`` (``x`` and ``y`` for planes), ``pmra``, ``pmdec``,
+        ``dec`` (for planes without WCS ``x`` and ``y``, or with
+        ``match_by='pattern'`` also ``ra`` and ``dec``), ``pmra``, ``pmdec``,
         ``parallax``, their ``_error`` and ``_corr``, ``ref_epoch``,
         ``radial_velocity``, and ``class``: 'qso' or 'galaxy' (motion and
         parallax zero), 'star', or 'position' (motion unknown; the default

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from photutils_mgauss.motions.columns import brightness
-from photutils_mgauss.sky.patterns import ENOUGH, Pattern, within
+from photutils_mgauss.sky.patterns import LEAST, Pattern, within
 from photutils_mgauss.sky.tangent_plane import MAS, TangentPlane, local_axes
 
 ON_THE_SKY = Pattern(scale=(0.95, 1.05), mirror=False)
@@ -65,7 +65,9 @@ def _one_after_another(lists, targets, find, apply):
     Lists that were found are targets for the others. Where no target is of
     use, the first list stays where it is, and None stands for that.
     """
-    targets, pending, found = list(targets), dict(lists), {}
+    targets, found = list(targets), {}
+    # A list of nothing stays where it is.
+    pending = {e: one for e, one in lists.items() if one.flux.size}
     while pending:
         e, result = _first_found(pending, targets, find)
         if e is None:
@@ -76,7 +78,8 @@ def _one_after_another(lists, targets, find, apply):
         targets.append(one if result is None else Objects(
             apply(result, one.places), one.flux))
     if pending:
-        _raise_not_found(min(pending))
+        e = min(pending)
+        _raise_not_found(e, pending[e].flux.size)
     return found
 
 
@@ -84,7 +87,7 @@ def _first_found(lists, targets, find):
     """Return the first list that is found in a target, and where."""
     for target in reversed(targets):
         for e, one in lists.items():
-            if min(one.flux.size, target.flux.size) < ENOUGH:
+            if min(one.flux.size, target.flux.size) < LEAST:
                 continue
             result = find(e, one, target)
             if result is not None:
@@ -92,7 +95,11 @@ def _first_found(lists, targets, find):
     return None, None
 
 
-def _raise_not_found(e):
+def _raise_not_found(e, n):
+    if n < LEAST:
+        msg = (f'epoch {e} must have at least {LEAST} objects to be matched '
+               f'by their pattern, got {n}')
+        raise ValueError(msg)
     msg = (f'epoch {e} must have a pattern of bright stars in common with '
            'the others or the references to be matched by it, got none: is '
            'it of the same field, and are there fluxes by which the '

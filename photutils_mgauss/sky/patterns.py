@@ -30,6 +30,7 @@ AGREE = 0.03     # of the field: by which votes for the same map may differ
 TRIALS = 12      # maps that are tried on all objects
 NEAR = 0.14      # of the mean distance of objects: what may be the same one
 ENOUGH = 6       # objects that a map has to bring together
+LEAST = 5        # or all of them, if a list has no more
 RARE = 1e-8      # as often it may do so by chance
 
 
@@ -80,30 +81,31 @@ class Pattern:
             NaN, all are as good.
         """
         order, target_order = _brightest(flux), _brightest(target_flux)
+        enough = max(LEAST, min(ENOUGH, len(flux), len(target_flux)))
         tried = set()
         for sizes in SIZES:
             n = min(sizes[0], points.shape[1])
             m = min(sizes[1], targets.shape[1])
-            if (n, m) in tried or min(n, m) < ENOUGH:
+            if (n, m) in tried or min(n, m) < enough:
                 continue
             tried.add((n, m))
             found = self._among(points[:, order[:n]],
-                                targets[:, target_order[:m]])
+                                targets[:, target_order[:m]], enough)
             if found is not None:
-                return _refined(found, points, targets)
+                return _refined(found, points, targets, enough)
         return None
 
-    def _among(self, points, targets):
+    def _among(self, points, targets, enough):
         """Return the map that some bright objects agree on, or None."""
         votes = self._votes(points, targets)
         if not votes.size:
             return None
         best, most = None, 0
         for vote in _most_agreed(votes, points):
-            found = _refined(_matrix(vote), points, targets)
+            found = _refined(_matrix(vote), points, targets, enough)
             # Three objects make an affine map and say nothing about it.
             by_chance = pdtrc(max(found.together - 4, 0), found.chance)
-            if (found.together > max(most, ENOUGH - 1)
+            if (found.together > max(most, enough - 1)
                     and by_chance < RARE):
                 best, most = found.matrix, found.together
         return best
@@ -229,7 +231,7 @@ def _spacing(targets):
     return np.sqrt(area / targets.shape[1])
 
 
-def _refined(matrix, points, targets):
+def _refined(matrix, points, targets, enough):
     """Return the `Found` map fitted to all that it brings together."""
     tree, spacing = cKDTree(targets.T), _spacing(targets)
     reach = NEAR * spacing
@@ -240,7 +242,7 @@ def _refined(matrix, points, targets):
         good = good[np.argsort(distance[good], kind='stable')]
         # Of several that claim one object the nearest has it.
         good = good[np.unique(near[good], return_index=True)[1]]
-        if len(good) < ENOUGH:
+        if len(good) < enough:
             break
         design = np.vstack([np.ones(len(good)), points[:, good]])
         matrix = np.linalg.lstsq(design.T, targets[:, near[good]].T,

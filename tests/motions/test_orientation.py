@@ -92,8 +92,8 @@ def test_pointings_and_rolls_are_found(rng, pair):
     assert (solution.alignment['wcs_residual'] < 0.01 * u.mas).all()
 
 
-def test_pointings_are_found_on_the_references(rng):
-    sky = sky_with_motions(rng)
+def catalogue_of(sky):
+    """Return the table of all stars as references."""
     ra, dec, motion, flux = sky
     references = QTable({
         'ra': ra * u.deg, 'dec': dec * u.deg,
@@ -103,6 +103,12 @@ def test_pointings_are_found_on_the_references(rng):
     for name, error in (('ra', u.mas), ('dec', u.mas),
                         ('pmra', u.mas / u.yr), ('pmdec', u.mas / u.yr)):
         references[f'{name}_error'] = np.full(len(ra), 0.1) * error
+    return references
+
+
+def test_pointings_are_found_on_the_references(rng):
+    sky = sky_with_motions(rng)
+    references, motion = catalogue_of(sky), sky[2]
     [epoch] = [seen_through(*fits_pair(90.0, 0.03, 0.0), sky, 2004.0, rng)]
     # A header whose pointing is that of a parked telescope.
     lost = Epoch(epoch.table, WCS(epoch.wcs.to_header()), epoch.time)
@@ -116,6 +122,27 @@ def test_pointings_are_found_on_the_references(rng):
         pull = (stars['pmra'].value - motion[0][stars['reference_row']]
                 ) / stars['pmra_error'].value
         assert rms(pull[known]) < 1.2
+
+
+def test_lists_without_wcs_are_found_on_references_in_the_sky(rng):
+    sky = sky_with_motions(rng)
+    true = fits_pair(0, 0, 0)[0]
+    epochs = [seen_through(true, None, sky, year, rng) for year in YEARS[:2]]
+    # One epoch and the catalogue's places are enough.
+    for some in (epochs, epochs[:1]):
+        solution = ProperMotionFitter(references=catalogue_of(sky),
+                                      match_by='pattern').fit(some)
+        stars = solution.stars
+        known = stars['reference_row'] >= 0
+        assert known.sum() > 0.97 * len(epochs[0].table)
+        pull = (stars['pmra'].value - sky[2][0][stars['reference_row']]
+                ) / stars['pmra_error'].value
+        assert rms(pull[known]) < 1.2
+        corners = [100, 1500, 100, 1500.0], [100, 100, 1500, 1500.0]
+        right = true.pixel_to_world(*corners)
+        for epoch in solution.epochs:
+            away = epoch.wcs.pixel_to_world(*corners).separation(right)
+            assert (away < 5 * u.mas).all()
 
 
 def pixel_lists(rng, changes, n=300):
@@ -159,3 +186,16 @@ def test_lists_without_a_common_pattern_raise(rng):
     others, _ = pixel_lists(rng, (same, same, same))
     with pytest.raises(ValueError, match='epoch 1 must have a pattern'):
         ProperMotionFitter(match_by='pattern').fit([epochs[0], others[1]])
+
+
+def test_five_objects_are_a_pattern(rng):
+    epochs, _ = pixel_lists(rng, (
+        same, lambda x, y: (900 - 0.5 * y, 0.5 * x), same), n=5)
+    stars = ProperMotionFitter(match_by='pattern').fit(epochs).stars
+    assert list(stars['n_good_obs']) == [3] * 5
+
+
+def test_four_objects_are_no_pattern(rng):
+    epochs, _ = pixel_lists(rng, (same, same, same), n=4)
+    with pytest.raises(ValueError, match=r'at least 5 objects .* got 4'):
+        ProperMotionFitter(match_by='pattern').fit(epochs)

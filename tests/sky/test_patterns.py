@@ -92,5 +92,14 @@ def test_what_is_known_of_the_map_is_used(rng):
 
 
 def test_fewer_objects_than_a_pattern_needs(rng):
-    few = rng.uniform(0, FIELD, (2, 5))
-    assert Pattern().find(few, few, np.ones(5), np.ones(5)) is None
+    few = rng.uniform(0, FIELD, (2, 4))
+    assert Pattern().find(few, few, np.ones(4), np.ones(4)) is None
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_five_objects_of_another_field_are_not_found(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, FIELD, (2, 5))
+    for n in (5, 40, 400):
+        targets = rng.uniform(0, FIELD, (2, n))
+        assert Pattern().find(points, targets, np.ones(5), np.ones(n)) is None
