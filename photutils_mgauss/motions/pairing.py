@@ -4,13 +4,14 @@ Pairs of rows and stars by position: one to one, nearest first.
 A tolerance comes from the errors, the time between the exposures and the
 known motions. Stars missing from some exposures are kept.
 """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from photutils_mgauss.motions.linking import calm_motion, lines_of
 from photutils_mgauss.sky.transforms import monomials
 from photutils_mgauss.utils.robust import std_about_zero
 
@@ -185,15 +186,25 @@ def match_positions(places, sigmas, years, tolerance, catalogue=None,
         The stars of the catalogue come first, in its order.
     """
     master = _start(catalogue)
-    rows = [None] * len(places)
+    n_known = len(master.year)
+    rows, slack = [None] * len(places), 0.0
+    calm = tolerance
+    if tolerance.radius is None:
+        calm = replace(tolerance, max_motion=calm_motion(
+            places, years, tolerance.max_motion))
     for e in np.argsort(years, kind='stable'):
         sigma = np.nan_to_num(sigmas[e], nan=0.0, posinf=0.0)
-        rows[e] = _match_one(master, places[e], sigma, years[e], tolerance,
-                             None if chips is None else chips[e])
+        rows[e], own = _match_one(master, places[e], sigma, years[e], calm,
+                                  None if chips is None else chips[e])
+        slack = max(slack, own)
+    if calm.max_motion < tolerance.max_motion:
+        rows = _linked(master, rows, n_known, tolerance, slack)
     table = np.full((len(places), len(master.year)), -1)
     for e, stars in enumerate(rows):
         table[e, stars] = np.arange(len(stars))
-    return Matches(table, master.ambiguous)
+    kept = (table >= 0).any(axis=0)
+    kept[:n_known] = True
+    return Matches(table[:, kept], master.ambiguous[kept])
 
 
 def _start(catalogue):
@@ -210,8 +221,12 @@ def _start(catalogue):
 
 
 def _match_one(master, places, sigma, year, tolerance, chip):
-    """Return the star of each row, adding the rows that are new stars."""
-    stars = np.full(places.shape[1], -1)
+    """
+    Return the star of each row, adding the rows that are new stars.
+
+    And the part of the tolerance that is not from errors.
+    """
+    stars, slack = np.full(places.shape[1], -1), 0.0
     finite = np.flatnonzero(np.isfinite(places).all(axis=0))
     usable = np.isfinite(master.position).all(axis=0)
     if usable.any() and len(finite):
@@ -231,7 +246,23 @@ def _match_one(master, places, sigma, year, tolerance, chip):
     new = np.flatnonzero(~old)
     stars[new] = len(master.year) + np.arange(len(new))
     master.extend(places[:, new], sigma[new], year)
-    return stars
+    return stars, slack
+
+
+def _linked(master, rows, n_known, tolerance, slack):
+    """Return the stars of rows with those of fast ones joined."""
+    count = np.bincount(np.concatenate(rows), minlength=len(master.year))
+    alone = np.flatnonzero((count == 1) & np.isfinite(master.position).all(
+        axis=0) & (np.arange(len(count)) >= n_known))
+    lines, couples = lines_of(
+        master.position[:, alone], master.sigma[alone], master.year[alone],
+        tolerance.max_motion, slack)
+    new = np.arange(len(count))
+    for group in (*lines, *couples):
+        new[alone[group]] = alone[group].min()
+    for group in couples:
+        master.ambiguous[alone[group]] = True
+    return [new[stars] for stars in rows]
 
 
 def _pair(master, tree, known, places, sigma, year, tolerance, slack):

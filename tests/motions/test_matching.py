@@ -165,3 +165,25 @@ def test_a_known_parallax_moves_a_star(rng):
     matches = match_positions([row], [np.full(row.shape[1], 0.1)], [2012.0],
                               FREE, known)
     assert_array_equal(matches.rows[0, :n], np.arange(n))
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_fast_star_in_a_dense_field_is_found_at_three_times(seed):
+    # Neighbours are 4500 mas from each other, and one in ten has no row.
+    rng = np.random.default_rng(seed)
+    n, years = 2000, (0.0, 1.0, 2.0, 4.0)
+    place, motion = rng.uniform(0, 2e5, (2, n)), rng.normal(0, 5, (2, n))
+    place[:, 0], motion[:, 0] = 1e5, 3000 * np.array([0.6, -0.8])
+    seen = rng.uniform(size=(4, n)) < 0.9
+    seen[:, 0] = True
+    numbers = [rng.permutation(np.flatnonzero(one)) for one in seen]
+    places = [(place + motion * year)[:, number]
+              + rng.normal(0, 3, (2, len(number)))
+              for year, number in zip(years, numbers, strict=True)]
+    matches = match_positions(
+        places, [np.full(len(number), 3.0) for number in numbers], years,
+        Tolerance(None, 3500.0, 2000.0))
+    found = matches.take(numbers, fill=-1)
+    whose = found.max(axis=0)
+    assert ((found == whose) | (found < 0)).all(axis=0).mean() > 0.998
+    assert (found == 0).all(axis=0).sum() == 1
