@@ -974,7 +974,7 @@ def fit_crowded_psf(
     data: ArrayLike | NDData, *, error: float | ArrayLike | None = None,
     mask: ArrayLike | None = None, stars: Table | None = None,
     n_components: int = 6, degree: int | Literal['auto'] = 'auto',
-    radius: float = 15, max_stars: int = 300, min_snr: float = 50,
+    radius: float | None = None, max_stars: int = 300, min_snr: float = 50,
     saturation: float | None = None, effective_gain: float | None = None,
     background_size: float | None = 64, max_passes: int = 20,
     executor: Executor | None = None,

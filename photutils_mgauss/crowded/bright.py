@@ -100,11 +100,12 @@ def size_differences(model):
         stamp = stamps.derivatives[0, first:first + w * w]
         out.append(_size_difference(stamp.reshape(w, w), s.flux[i],
                                     model.weight[window],
-                                    model.residual[window]))
+                                    model.residual[window],
+                                    model.psf.scale))
     return np.array([value for value in out if np.isfinite(value)])
 
 
-def _size_difference(stamp, flux, weight, residual):
+def _size_difference(stamp, flux, weight, residual, scale):
     # A bright star's PSF error is in proportion to its light, whatever the
     # photon noise: all pixels of the stamp count alike.
     good = (weight > 0).astype(float)
@@ -120,6 +121,6 @@ def _size_difference(stamp, flux, weight, residual):
     change = (c * (good * slope * data).sum()
               - b * (good * stamp * data).sum()) / det
     j, k = np.indices(stamp.shape) - len(stamp) // 2
-    core = (j**2 + k**2) <= 9
+    core = (j**2 + k**2) <= 9 * scale**2
     size = (stamp * core * (j**2 + k**2)).sum() / (2 * (stamp * core).sum())
     return change / size

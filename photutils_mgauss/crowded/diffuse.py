@@ -34,10 +34,12 @@ class Diffuse:
     ----------
     shape, origin : (y, x) tuple of int
         The pixels of the tile, and where in the image its first one is.
+    scale : float, optional
+        By what blocks are wider, for a wide PSF.
     """
 
-    def __init__(self, shape, origin):
-        self.mesh = Mesh(shape, origin, _BLOCK)
+    def __init__(self, shape, origin, scale=1.0):
+        self.mesh = Mesh(shape, origin, scale * _BLOCK)
         self.level = np.zeros(self.mesh.size)
 
     def image(self):

@@ -95,13 +95,13 @@ def _level_damping(model):
     return _LEVEL_DAMPING * np.maximum(mean, 1)
 
 
-def limited(step, stars):
+def limited(step, stars, scale=1.0):
     """Return a step (n, 3) no longer than stars may go at once."""
     out = np.empty_like(step)
     out[:, 0] = np.clip(step[:, 0], (_LEAST_CHANGE - 1) * stars.flux,
                         (MOST_CHANGE - 1) * stars.flux)
     for k, drift in enumerate(stars.drift, 1):
-        move = np.clip(step[:, k], -MAX_MOVE, MAX_MOVE)
+        move = np.clip(step[:, k], -scale * MAX_MOVE, scale * MAX_MOVE)
         out[:, k] = np.where(np.isfinite(stars.bound), np.clip(
             move, -stars.bound - drift, stars.bound - drift), move)
     return out

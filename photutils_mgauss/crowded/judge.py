@@ -9,7 +9,7 @@ such surface has.
 """
 import numpy as np
 
-# Half the width of the pixels that are looked at.
+# Half the width of the pixels that are looked at, of wide PSFs more.
 _HALF = 3
 # Neighbours up to so many times as bright are put back, too.
 _PUT_BACK = 2.0
@@ -35,8 +35,8 @@ def smooth_light(models):
 def _needed(model, which):
     """Return how much worse a surface is, and what it should be (2, n)."""
     s, (ny, nx) = model.stars, model.data.shape
-    j, i = (v.ravel() for v in np.indices((2 * _HALF + 1, 2 * _HALF + 1))
-            - _HALF)
+    half = round(model.psf.scale * _HALF)
+    j, i = (v.ravel() for v in np.indices((2 * half + 1,) * 2) - half)
     y = np.rint(s.y[which]).astype(int)[:, None] + j
     x = np.rint(s.x[which]).astype(int)[:, None] + i
     seen = (y >= 0) & (y < ny) & (x >= 0) & (x < nx)
@@ -45,7 +45,7 @@ def _needed(model, which):
     residual = model.residual[at]
     own = _light(model, which, x, y)
     light = own + _beside(model, which, x, y)
-    u, v = i / _HALF, j / _HALF
+    u, v = i / half, j / half
     terms = np.stack([np.ones(u.size), u, v, u * u, u * v, v * v])
     # What stars have left over may have a slope of its own.
     worse = (_rest(residual + light, weight, terms)

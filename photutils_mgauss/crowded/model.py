@@ -17,11 +17,10 @@ from photutils_mgauss import kernels
 from photutils_mgauss.crowded.background import Mesh
 from photutils_mgauss.crowded.diffuse import Diffuse
 from photutils_mgauss.crowded.stars import Neighbours, Stars
-from photutils_mgauss.psf.local import MAX_WING
 from photutils_mgauss.psf.wings import WINGS
 
 # Fit stamps are 7 or 9 pixels wide, 13 for bright stars: almost all of the
-# information on a position lies in the core.
+# information on a position lies in the core. Of wide PSFs they are wider.
 _MIN_HALF, _MAX_HALF, _BRIGHT_HALF = 3, 4, 6
 # In units of noise over the PSF's peak.
 _BRIGHT_FLUX = 300
@@ -78,7 +77,7 @@ class Model:
         self.mesh = Mesh(self.data.shape, origin,
                          size or max(self.data.shape))
         # Stars hide the sky.
-        self.diffuse = Diffuse(self.data.shape, origin)
+        self.diffuse = Diffuse(self.data.shape, origin, self.psf.scale)
         if not size:
             self.level = self.first_level = np.zeros(self.mesh.size)
             self.limits = -np.inf, np.inf
@@ -118,15 +117,15 @@ class Model:
         s = self.stars
         flux = np.maximum(s.flux[chosen], 1e-300)
         profile = self.psf.profile
+        least, usual, widest = (round(self.psf.scale * half) for half in (
+            _MIN_HALF, _MAX_HALF, _BRIGHT_HALF))
         wing = np.clip(
             np.searchsorted(-profile, -_WING_NOISE * self.noise / flux),
-            _MIN_HALF, MAX_WING)
+            least, self.psf.max_wing)
         bright = flux * profile[0] > _BRIGHT_FLUX * self.noise
-        half = np.clip(wing, _MIN_HALF, np.where(
-            bright, _BRIGHT_HALF, _MAX_HALF))
+        half = np.clip(wing, least, np.where(bright, widest, usual))
         seeded = s.seeded[chosen]
-        half[seeded] = np.maximum(_BRIGHT_HALF + 2,
-                                  s.core[chosen][seeded] + WINGS)
+        half[seeded] = np.maximum(widest + 2, s.core[chosen][seeded] + WINGS)
         width = 2 * half + 1
         ends = np.concatenate([[0], np.cumsum(width**2)]).astype(np.int64)
         return np.maximum(wing, half).astype(np.int64), kernels.Stamps(
@@ -166,7 +165,8 @@ class Model:
         self._connect()
 
     def _connect(self):
-        self.neighbours = Neighbours.of(self.stars.x, self.stars.y)
+        self.neighbours = Neighbours.of(self.stars.x, self.stars.y,
+                                        self.psf.scale)
 
     def take(self, step, level_step):
         """Change the stars by a step (n, 3), and the level; draw nothing."""

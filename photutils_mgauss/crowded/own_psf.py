@@ -14,7 +14,7 @@ __all__ = ['fit_crowded_psf']
 
 
 def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
-                    n_components=6, degree='auto', radius=15, max_stars=300,
+                    n_components=6, degree='auto', radius=None, max_stars=300,
                     min_snr=50, saturation=None, effective_gain=None,
                     background_size=64, max_passes=20, executor=None,
                     checkpoint=None, progress_bar=False):
@@ -56,7 +56,8 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
         forty stars for each term, at most 4: 2 with 300 stars, 3 with 400.
         Terms that are not significant are shrunk.
     radius : float, optional
-        The radius of the circle of fitted pixels around each star [pix].
+        The radius of the circle of fitted pixels around each star [pix]; by
+        default 15, and more in proportion for PSFs wider than 3 pixels.
     max_stars : int, optional
         The largest number of stars to use for the PSF, spread over the
         image.
@@ -125,7 +126,9 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
     if saturation is not None:
         image = without_saturated(image, as_saturation(saturation))
     rules = Rules(
-        radius=as_real(radius, 'radius', minimum=5),
+        radius=(Rules.radius if radius is None
+                else as_real(radius, 'radius', minimum=5)),
+        is_fixed=radius is not None,
         max_stars=as_integer(max_stars, 'max_stars', minimum=1),
         min_snr=as_real(min_snr, 'min_snr', above=0), given=given)
     if degree != 'auto':

@@ -96,8 +96,8 @@ class CrowdedMixturePhotometry:
         stars stay the same; if two stars share light, the fainter one gets
         less of it. 0 means no prior.
     background_size : float or None, optional
-        The distance of the nodes of the bilinear background [pix], or None
-        if there is no background to fit.
+        The distance of the nodes of the bilinear background [pix], larger for
+        PSFs wider than 3 pixels, or None if no background is fitted.
     psf_error : float, optional
         The uncertainty of the PSF, as a fraction: smaller residuals of bright
         stars do not count as stars.
@@ -323,7 +323,7 @@ class CrowdedMixturePhotometry:
             given = (None if init_params is None
                      else self._listed(init_params, image.unit))
             psf = self._psf_of(image)
-            options = self._options(image)
+            options = self._options(image).widened(psf.scale)
             solved = self._solve(image, psf, options, given)
             known = None
             if self.residual_radius is not None and not solved.unfinished:
@@ -351,8 +351,8 @@ class CrowdedMixturePhotometry:
         return solved
 
     def _solve_once(self, image, psf, options, given):
-        plan = Plan(image, psf, options, self.tile_shape, self.overlap,
-                    given, self._checkpoint)
+        plan = Plan(image, psf, options, self.tile_shape,
+                    round(self.overlap * psf.scale), given, self._checkpoint)
         return Solved.of(plan, self.executor, self.progress_bar, stacklevel=5)
 
     def fit_images(self, images, stars=None, *, motions=False):

@@ -21,6 +21,7 @@ from photutils_mgauss.field.base import lattice
 from photutils_mgauss.field.choice import POOR
 from photutils_mgauss.field.fit import fit_mixture_field, with_light_beyond
 from photutils_mgauss.field.stages import n_terms
+from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.psf.renderer import MixtureRenderer
 from photutils_mgauss.utils.image import with_unit
 from photutils_mgauss.utils.waiting import progress
@@ -50,6 +51,9 @@ _REST = 2e-3
 _LARGEST, _WINDOW, _WINDOWS = 1536, 320, 5
 # Where the PSF of two passes is compared, and how far from its centre [pix].
 _PLACES, _REACH = (3, 3), 8
+# The first PSF is fitted again with longer lengths while it is wider than they
+# are meant for by more than this factor.
+_WIDER, _MOST_WIDER = 1.1, 8
 # Stars are drawn out to where this fraction of the noise is left of them.
 _FAINTEST = 1e-3
 
@@ -66,8 +70,12 @@ class LoopOptions:
 
     def radius(self, number):
         """Return the radius of the stamps of a pass."""
-        return min((*_RADII, self.rules.radius)[min(number, len(_RADII))],
-                   self.rules.radius)
+        wide = self.rules.scale * np.array([*_RADII, np.inf])
+        return min(wide[min(number, len(_RADII))], self.rules.radius)
+
+    def widened(self, field):
+        """Return the options for a PSF as wide as that of a field."""
+        return replace(self, rules=self.rules.widened(scale_of(field)))
 
     def degree_of(self, number, n_stars):
         """Return the degree of a pass with so many stars."""
@@ -230,6 +238,7 @@ def fit_field(pixels, options, solve, effective_gain=None):
     """
     image = CrowdedImage.of(pixels, effective_gain)
     passes, steady = [first_field(image, options.rules)], 0
+    options = options.widened(passes[0])
     with progress(total=options.max_passes, desc='PSF',
                   shown=options.progress_bar) as bar:
         for number in range(options.max_passes):
@@ -270,7 +279,23 @@ def _with_unit(field, unit):
     return replace(field, stars=stars, dropped=dropped)
 
 
+def scale_of(field):
+    """Return by how much a field's PSF is wider than a narrow one."""
+    return LocalPSF.of(grid_of(field)).scale
+
+
 def first_field(image, rules):
+    """Fit two Gaussians to stars, on stamps as large as they are wide."""
+    for _ in range(_MOST_WIDER):
+        field = _fit_first(image, rules)
+        scale = scale_of(field)
+        if scale <= _WIDER * rules.scale:
+            break
+        rules = rules.widened(scale)
+    return field
+
+
+def _fit_first(image, rules):
     """Fit two Gaussians, the same everywhere, to the least blended stars."""
     data, variance = np.zeros(image.shape), np.zeros(image.shape)
     parts = []
@@ -291,7 +316,7 @@ def first_field(image, rules):
     stars['selected'][weak] = False
     return fit_mixture_field(
         data, stars, error=np.sqrt(variance), n_components=2, degree=0,
-        radius=psf_stars.FIRST_RADIUS, local_bkg=True, normalise='stamps',
+        radius=rules.first_radius, local_bkg=True, normalise='stamps',
         brighter_fatter=False)
 
 

@@ -1,5 +1,5 @@
 """Which stars of a crowded image its PSF can be measured from."""
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from astropy.table import QTable
@@ -14,6 +14,9 @@ from photutils_mgauss.utils.star_columns import words_column
 # How many stars the first, round PSF is made of, of how many pixels around
 # them, and how few stars are too few for any [pix].
 FIRST_STARS, FIRST_RADIUS, FEWEST = 60, 5, 5
+# For what width stars are first looked for [pix]. All lengths follow the width
+# of the PSF if that is larger.
+_FIRST_FWHM = 3.0
 # Stars with less than this share of the light in their pixels are blends.
 _OWN_LIGHT = 0.5
 # A star of the user's list is the brightest this near to its place [pix].
@@ -29,13 +32,27 @@ class Rules:
 
     ``radius`` is that of its stamp [pix], ``min_snr`` the least ratio of its
     flux to the error of it, ``given`` None or the places (n, 2) of the only
-    stars that count.
+    stars that count. ``scale`` is by how much the PSF is wider than a narrow
+    one; the radius follows it unless it ``is_fixed``.
     """
 
     radius: float = 15
     max_stars: int = 300
     min_snr: float = 50
     given: np.ndarray | None = None
+    is_fixed: bool = False
+    scale: float = 1.0
+
+    def widened(self, scale):
+        """Return the rules for a PSF that is wider by a factor."""
+        radius = self.radius if self.is_fixed else (
+            self.radius * scale / self.scale)
+        return replace(self, radius=radius, scale=scale)
+
+    @property
+    def first_radius(self):
+        """The radius of the stamps of the first PSF [pix]."""
+        return self.scale * FIRST_RADIUS
 
 
 def first_stars(data, variance, rules):
@@ -57,17 +74,19 @@ def first_stars(data, variance, rules):
     good = variance > 0
     found = select_psf_stars(
         np.where(good, data - np.percentile(data[good], 20), np.nan),
-        error=np.sqrt(variance), radius=FIRST_RADIUS, isolation=0,
-        min_snr=rules.min_snr)
+        error=np.sqrt(variance), radius=rules.first_radius, isolation=0,
+        # Its aperture is a small part of a wide star.
+        min_snr=rules.min_snr / rules.scale, fwhm=rules.scale * _FIRST_FWHM)
     x, y, flux = (np.asarray(found[name]) for name in ('x', 'y', 'flux'))
-    usable = found['selected'] & _is_given(x, y, flux, rules.given)
+    usable = found['selected'] & _is_given(x, y, flux, rules)
+    radius = rules.first_radius
     places = np.column_stack([x, y])
     tree = KDTree(places)
     found['merit'] = 0.0
     for i in np.flatnonzero(usable):
-        near = np.array(tree.query_ball_point(places[i], 2 * FIRST_RADIUS))
+        near = np.array(tree.query_ball_point(places[i], 2 * radius))
         far = ((places[near] - places[i])**2).sum(axis=1)
-        light = flux[near] * np.exp(-2 * far / FIRST_RADIUS**2)
+        light = flux[near] * np.exp(-2 * far / radius**2)
         found['merit'][i] = flux[i] / (light.sum() - flux[i]
                                        + flux[i] / found['snr'][i])
     found['selected'] = usable
@@ -107,7 +126,7 @@ def judge(table, variance, psf_error, rules):
         # Errors grow with chi2, and that with what the PSF lacks as yet.
         seen = snr * np.sqrt(np.fmax(table['reduced_chi2'], 1))
     flags = np.asarray(table['flags'])
-    masked = _without_core(x, y, variance)
+    masked = _without_core(x, y, variance, rules.scale)
     reason = np.full(len(table), '', dtype='U9')
     for name, applies in (
             ('edge', np.asarray(table['margin']) < rules.radius),
@@ -117,7 +136,7 @@ def judge(table, variance, psf_error, rules):
             ('blended', ~(own_light > _OWN_LIGHT))):
         reason[(reason == '') & applies] = name
     good = np.flatnonzero((reason == '')
-                          & _is_given(x, y, flux, rules.given))
+                          & _is_given(x, y, flux, rules))
     reason[good] = 'surplus'
     best = _even_choice(x[good], y[good], doubt[good], variance.shape,
                         rules.max_stars)
@@ -128,7 +147,7 @@ def judge(table, variance, psf_error, rules):
 def _candidates(table, snr, reason, rules):
     x, y, flux = positions(table)
     wanted = (snr >= rules.min_snr if rules.given is None
-              else _is_given(x, y, flux, rules.given))
+              else _is_given(x, y, flux, rules))
     row = np.flatnonzero(wanted)
     return QTable({
         'row': row, 'x': x[row], 'y': y[row], 'flux': flux[row],
@@ -137,24 +156,25 @@ def _candidates(table, snr, reason, rules):
         'reason': words_column(reason[row])})
 
 
-def _is_given(x, y, flux, given):
+def _is_given(x, y, flux, rules):
     """Return which stars are meant by places (n, 2); all if there are none."""
-    if given is None:
+    if rules.given is None:
         return np.ones(len(x), bool)
     meant = np.zeros(len(x), bool)
     if len(x):
         for near in KDTree(np.column_stack([x, y])).query_ball_point(
-                given, _SAME):
+                rules.given, rules.scale * _SAME):
             if near:
                 meant[near[np.argmax(flux[near])]] = True
     return meant
 
 
-def _without_core(x, y, variance):
+def _without_core(x, y, variance, scale):
     """Return which stars have bad pixels in their cores."""
     row, column = (np.clip(np.rint(v), 0, n - 1).astype(int)
                    for v, n in zip((y, x), variance.shape, strict=True))
-    return maximum_filter(variance <= 0, _CORE)[row, column]
+    core = 2 * round(scale * (_CORE // 2)) + 1
+    return maximum_filter(variance <= 0, core)[row, column]
 
 
 def _even_choice(x, y, doubt, shape, most):

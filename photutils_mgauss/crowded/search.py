@@ -7,6 +7,9 @@ from photutils_mgauss import kernels
 from photutils_mgauss.crowded.stars import Stars
 from photutils_mgauss.crowded.tile import CELL
 
+# Lengths are those for a PSF of the usual width; of a wider one they are
+# wider.
+
 # Pixels where nine together stand out less than this fraction of the
 # threshold are not looked at.
 _HINT = 0.4
@@ -25,16 +28,17 @@ _OUTSIDE = 3.0
 def find(tile, threshold, found_in):
     """Add the maxima of significance on the residual."""
     significance, flux = _scores(tile, threshold)
-    found = peaks(significance, flux, threshold, found_in)[2]
-    good = apart(found, tile.model.stars, tile.rejected)
+    scale = tile.model.psf.scale
+    found = peaks(significance, flux, threshold, found_in, scale)[2]
+    good = apart(found, tile.model.stars, tile.rejected, scale)
     good &= bright_enough(found, tile.least)
     tile.admit(found.chosen(good))
 
 
-def peaks(significance, flux, threshold, found_in):
+def peaks(significance, flux, threshold, found_in, scale=1.0):
     """Return rows and columns of maxima (n,), and the stars there."""
     peak = (significance > threshold) & (
-        significance == maximum_filter(significance, 3))
+        significance == maximum_filter(significance, 2 * round(scale) + 1))
     y, x = np.nonzero(peak)
     dx, dy = _vertex(significance, x, y)
     return y, x, Stars(x + dx, y + dy, flux[y, x],
@@ -43,6 +47,7 @@ def peaks(significance, flux, threshold, found_in):
 
 def _scores(tile, threshold):
     model, templates = tile.model, tile.templates
+    scale = model.psf.scale
     ny, nx = model.data.shape
     significance = np.zeros((ny, nx))
     flux = np.zeros((ny, nx))
@@ -56,19 +61,20 @@ def _scores(tile, threshold):
     fit = kernels.Fit(model.stars.sources, model.stamps,
                       model.neighbours.pairs, tile.equations.stars)
     kernels.score_beside(fit, templates, model.planes(light),
-                         kernels.Limits(REACH, LEAST, float(threshold)),
+                         kernels.Limits(scale * REACH, LEAST,
+                                        float(threshold)),
                          kernels.BesideScratch.empty(), significance, flux)
     return significance, flux
 
 
-def apart(found, known, rejected):
+def apart(found, known, rejected, scale=1.0):
     """Tell which stars are away from those known and places (n, 2)."""
     out = np.ones(len(found), bool)
     positions = np.column_stack([found.x, found.y])
     stars = np.column_stack([known.x, known.y])
     for places, limit in ((stars, SEPARATION), (rejected, _REJECTED)):
         if len(places) and len(found):
-            out &= cKDTree(places).query(positions)[0] > limit
+            out &= cKDTree(places).query(positions)[0] > scale * limit
     return out
 
 
@@ -91,14 +97,14 @@ def leave_out(tile, threshold):
     with np.errstate(invalid='ignore'):
         strength = s.flux / np.sqrt(covariance[:, 0, 0])
     weak = weakest(s, tile.model.neighbours, strength, threshold,
-                   tile.model.data.shape)
+                   tile.model.data.shape, tile.model.psf.scale)
     gone = np.flatnonzero(weak)
     places = np.column_stack([s.x[gone], s.y[gone]])
     tile.dismiss(weak)
     return places
 
 
-def weakest(s, p, strength, threshold, shape):
+def weakest(s, p, strength, threshold, shape, scale=1.0):
     """
     Tell which stars of a strength (n,) are to go, the weakest first.
 
@@ -107,6 +113,7 @@ def weakest(s, p, strength, threshold, shape):
     weak = ~(strength >= threshold) & ~s.listed
     distance = np.hypot(s.x[p.owner] - s.x[p.neighbour],
                         s.y[p.owner] - s.y[p.neighbour])
+    distance /= scale
     fainter = (distance < 2) & (s.flux[p.neighbour] < s.flux[p.owner])
     weak[p.owner[fainter & weak[p.neighbour]]] = False
     # Where equations have no solution it is not the brightest that is extra.

@@ -44,6 +44,12 @@ class TileOptions:
         """The significance from which stars are fitted, reported or not."""
         return min(self.depth, self.threshold)
 
+    def widened(self, scale):
+        """Return options for a PSF that is wider by a factor."""
+        if self.background_size is None:
+            return self
+        return replace(self, background_size=scale * self.background_size)
+
     def less_deep(self, factor):
         """Return options with limits that are raised by a factor."""
         return replace(self, threshold=factor * self.threshold,
@@ -198,7 +204,8 @@ class Tile(Searched):
 
     def _solve(self, damping):
         step, level_step = self.equations.solve(damping)
-        return limited(step, self.model.stars), level_step
+        return limited(step, self.model.stars,
+                       self.model.psf.scale), level_step
 
     def step(self, damping=0.0, moving=slice(None)):
         """Take one Gauss-Newton step, of all stars or only some."""
@@ -216,7 +223,7 @@ class Tile(Searched):
         at rest stay as they are.
         """
         self.refresh()
-        region = _trust_region(self.model.stars)
+        region = _trust_region(self.model.stars, self.model.psf.scale)
         self.moved = np.zeros(len(self.model.stars))
         for _ in range(n_steps):
             self._polish_once(damping, region)
@@ -267,7 +274,8 @@ def _templates(psf, shape):
     """Draw a star for each cell."""
     ny, nx = shape
     stamps = [[psf.stamp((x + min(x + CELL, nx)) // 2,
-                         (y + min(y + CELL, ny)) // 2, _TEMPLATE_HALF)
+                         (y + min(y + CELL, ny)) // 2,
+                         round(psf.scale * _TEMPLATE_HALF))
                for x in range(0, nx, CELL)] for y in range(0, ny, CELL)]
     return kernels.Templates(np.array(stamps), CELL)
 
@@ -276,10 +284,10 @@ def _parameters(stars):
     return np.column_stack([stars.flux, stars.x, stars.y])
 
 
-def _trust_region(stars):
+def _trust_region(stars, scale):
     """Return the limits (n, 3) of stars that are being polished."""
     now = _parameters(stars)
-    roam = np.full_like(now, ROAM)
+    roam = np.full_like(now, scale * ROAM)
     low, high = roam.copy(), roam
     low[:, 0], high[:, 0] = stars.flux / 2, stars.flux
     return now - low, now + high

@@ -14,7 +14,11 @@ from photutils_mgauss.psf.base import PSFModel
 from photutils_mgauss.psf.grid import cells, match
 from photutils_mgauss.psf.rows import falls, kernel_rows
 
+# How far wings are followed [pix], of wide PSFs further.
 MAX_WING = 60
+# Lengths that suit PSFs of up to this area, of a FWHM of about 3 pixels, are
+# larger in proportion for wider ones [pix^2].
+_USUAL_AREA = 30.0
 # A cell's families are merged if that changes no pixel by more than this
 # fraction of the peak.
 _MERGE_TOLERANCE = 1e-3
@@ -55,9 +59,10 @@ class LocalPSF:
                   order, np.zeros(shape, bool))
         for j, i in np.ndindex(shape):
             psf._join_families(j, i)
-        stamp = psf.stamp(x_grid.mean(), y_grid.mean(), MAX_WING)
-        return replace(psf, profile=_profile(stamp),
-                       area=stamp.sum()**2 / (stamp**2).sum())
+        middle = x_grid.mean(), y_grid.mean()
+        psf = replace(psf, area=_area(psf.stamp(*middle, MAX_WING)))
+        return replace(psf, profile=_profile(psf.stamp(*middle,
+                                                       psf.max_wing)))
 
     @classmethod
     def of(cls, model):
@@ -70,6 +75,16 @@ class LocalPSF:
         return cls.from_nodes(
             grid.x_grid, grid.y_grid, grid.weights * grid.scales[:, None],
             grid.means, grid.covariances, model.pixel_integrated or None)
+
+    @property
+    def scale(self):
+        """By what lengths exceed those that suit narrow PSFs, at least 1."""
+        return max(1.0, np.sqrt(self.area / _USUAL_AREA))
+
+    @property
+    def max_wing(self):
+        """How far wings are followed [pix]."""
+        return int(np.ceil(MAX_WING * self.scale))
 
     @property
     def n_rows(self):
@@ -171,14 +186,18 @@ class LocalPSF:
         return out
 
 
+def _area(stamp):
+    return stamp.sum()**2 / (stamp**2).sum()
+
+
 def _profile(stamp):
     """Return the brightest pixel at each distance, never rising."""
-    distance = np.hypot(*np.mgrid[-MAX_WING:MAX_WING + 1,
-                                  -MAX_WING:MAX_WING + 1])
+    half = len(stamp) // 2
+    distance = np.hypot(*np.mgrid[-half:half + 1, -half:half + 1])
     ring = np.rint(distance).astype(int).ravel()
     top = np.zeros(ring.max() + 1)
     np.maximum.at(top, ring, stamp.ravel())
-    return np.maximum.accumulate(top[MAX_WING::-1])[::-1]
+    return np.maximum.accumulate(top[half::-1])[::-1]
 
 
 def _merge(weights, means, covariances):

@@ -288,6 +288,7 @@ def test_the_loop_ends_where_the_psf_no_longer_goes_one_way(
                               stars=Table({'used': [True]}))
               for place in places]
     passes = iter(fields[1:])
+    monkeypatch.setattr(psf_loop, 'scale_of', lambda _: 1.0)
     for name, instead in {
             'first_field': lambda *_: fields[0],
             'next_field': lambda *_: (next(passes), None),
