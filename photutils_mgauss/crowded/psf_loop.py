@@ -18,8 +18,9 @@ from astropy.utils.exceptions import AstropyUserWarning
 from photutils_mgauss.crowded import psf_stars
 from photutils_mgauss.crowded.far_light import far_light
 from photutils_mgauss.field.base import lattice
-from photutils_mgauss.field.choice import POOR
-from photutils_mgauss.field.fit import fit_mixture_field, with_light_beyond
+from photutils_mgauss.field.choice import warn_of_few
+from photutils_mgauss.field.fit import field_of_stars, with_light_beyond
+from photutils_mgauss.field.options import FieldOptions
 from photutils_mgauss.field.stages import n_terms
 from photutils_mgauss.psf.local import LocalPSF
 from photutils_mgauss.psf.renderer import MixtureRenderer
@@ -314,10 +315,9 @@ def _fit_first(image, rules):
     _check_number(stars, rules)
     weak = np.argsort(-stars['merit'])[psf_stars.FIRST_STARS:]
     stars['selected'][weak] = False
-    return fit_mixture_field(
-        data, stars, error=np.sqrt(variance), n_components=2, degree=0,
-        radius=rules.first_radius, local_bkg=True, normalise='stamps',
-        brighter_fatter=False)
+    return field_of_stars(
+        data, stars, np.sqrt(variance), None, FieldOptions(
+            2, 0, rules.first_radius, local_bkg=True, normalise='stamps'))
 
 
 def _found_in(window, data, variance, rules):
@@ -357,28 +357,22 @@ def next_field(image, field, number, options, solve):
 
 def _fit(solved, psf, used, number, options):
     """Fit a field to some stars, all others taken off."""
-    return fit_mixture_field(
-        solved.with_stars(psf, used), used, error=np.sqrt(solved.variance),
-        n_components=options.n_components,
-        degree=options.degree_of(number, len(used)),
-        radius=options.radius(number), local_bkg=number < _OWN_SKY,
-        effective_gain=np.inf, normalise='stamps', brighter_fatter=False)
+    return field_of_stars(
+        solved.with_stars(psf, used), used, np.sqrt(solved.variance), None,
+        FieldOptions(
+            options.n_components, options.degree_of(number, len(used)),
+            options.radius(number), local_bkg=number < _OWN_SKY,
+            effective_gain=np.inf, normalise='stamps'))
 
 
 def _tell_of_few(field, before, solved, number, options):
     """Warn if fewer Gaussians than usual miss light that more would have."""
-    n = options.n_components
-    if n >= LoopOptions.n_components or field.accuracy < POOR:
-        return
-    used = field.stars['x_fit', 'y_fit', 'flux_fit'][field.stars['used']]
-    used.rename_columns(used.colnames, ['x', 'y', 'flux'])
-    more = _fit(solved, grid_of(before), used, number, replace(
-        options, n_components=LoopOptions.n_components, degree=field.degree))
-    if field.accuracy - more.accuracy > POOR:
-        warnings.warn(
-            f'n_components={n} misses {field.accuracy:.1%} of the light in '
-            f'the pixels of bright stars: the default of {more.n_components} '
-            f'misses {more.accuracy:.1%}', AstropyUserWarning, stacklevel=5)
+    def refit(n):
+        used = field.stars['x_fit', 'y_fit', 'flux_fit'][field.stars['used']]
+        used.rename_columns(used.colnames, ['x', 'y', 'flux'])
+        return _fit(solved, grid_of(before), used, number, replace(
+            options, n_components=n, degree=field.degree))
+    warn_of_few(field, refit, stacklevel=6)
 
 
 def _with_reasons(field, stars):

@@ -6,9 +6,11 @@ is left out, the shapes are fitted to the others, and what they say of those
 left out, whose positions and fluxes are fitted, is the score.
 """
 import logging
+import warnings
 
 import numpy as np
 from astropy.table import QTable
+from astropy.utils.exceptions import AstropyUserWarning
 
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.normal import equations, optimise
@@ -101,6 +103,32 @@ def run_with_enough_components(problem, degree, workers, *, strength=1.0,
               _USUAL_COMPONENTS, 100 * fit.accuracy,
               _MORE_COMPONENTS, 100 * more.accuracy)
     return stages.finish(more, workers, reject, stages.BRISK)
+
+
+def warn_of_few(field, refit, *, stacklevel):
+    """
+    Warn if fewer Gaussians than usual miss light that these would have.
+
+    Parameters
+    ----------
+    field : MixtureField
+    refit : callable
+        ``refit(n)`` returns the field of n Gaussians from the same stars.
+    stacklevel : int
+        That of the warning.
+    """
+    n = field.n_components
+    if n >= _USUAL_COMPONENTS or field.accuracy < POOR:
+        return
+    with warnings.catch_warnings():
+        # The field has given those that concern the stars.
+        warnings.simplefilter('ignore', AstropyUserWarning)
+        more = refit(_USUAL_COMPONENTS)
+    if field.accuracy - more.accuracy > POOR:
+        warnings.warn(
+            f'n_components={n} misses {field.accuracy:.1%} of the light in '
+            f'the pixels of bright stars, n_components={more.n_components} '
+            f'{more.accuracy:.1%}', AstropyUserWarning, stacklevel=stacklevel)
 
 
 def choose(problem, n_components, degree, max_degree, strength, workers):

@@ -21,9 +21,10 @@ from scipy.sparse.linalg import LinearOperator, lsqr
 
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import lattice
-from photutils_mgauss.field.fit import fit_mixture_field
+from photutils_mgauss.field.fit import field_of_stars
 from photutils_mgauss.field.input import normalised, read_sample
 from photutils_mgauss.field.mixture_field import MixtureField
+from photutils_mgauss.field.options import FieldOptions
 from photutils_mgauss.utils.equality import ComparedByValue
 from photutils_mgauss.utils.validation import (
     as_grid_shape,
@@ -127,10 +128,10 @@ class EmpiricalPSF(ComparedByValue):
         """
         oversampling = as_integer(oversampling, 'oversampling', minimum=1)
         with waiting('EmpiricalPSF.from_stars'):
-            field = fit_mixture_field(
-                data, stars, error=error, mask=mask, n_components=n_components,
-                degree=degree, radius=radius, normalise='stamps',
-                brighter_fatter=False,
+            # What its Gaussians miss is fitted next.
+            field = field_of_stars(
+                data, stars, error, mask, FieldOptions(
+                    n_components, degree, radius, normalise='stamps'),
                 executor=executor)
             problem = _Lattice.of(field, oversampling)
             target, weights = _corrections(field, read_sample(

@@ -26,6 +26,7 @@ from photutils_mgauss.field.choice import (
     POOR,
     choose,
     run_with_enough_components,
+    warn_of_few,
 )
 from photutils_mgauss.field.contexts import lateral_shifts
 from photutils_mgauss.field.covariance import (
@@ -117,7 +118,8 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         time, where 6 miss 0.5 % of the light of bright pixels of 60 stars
         or more, or where 300 stars or more, when left out of the fit, are
         clearly better described by 8; not if stars are so narrow that
-        pixels are integrated.
+        pixels are integrated. A warning says where fewer than 6, if you
+        give them, miss 0.5 % more of that light than 6 do.
     degree : int or 'auto', optional
         The degree of the polynomials, 0 for a PSF that is the same
         everywhere; by default 4, or 'auto' with 8 to 59 stars, or 1 with
@@ -233,27 +235,54 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         regularization, start, centre, normalise, pixel_integrated,
         correlated_noise, contexts, brighter_fatter)
     given = data, stars, error, mask
+    how = {'executor': executor, 'progress_bar': progress_bar}
     with waiting('fit_mixture_field', progress_bar):
-        sample, radius = _read(given, options)
-        if options.correlated_noise:
-            allow_for_correlation(sample)
-        n_components, degree = options.size(sample.n_places)
-        top = possible_degree(degree, sample)
-        problem = sample.problem(top, options.local_bkg)
-        with Workers(executor) as workers, progress(workers, progress_bar):
-            if start is not None:
-                return _tuned_field(problem, sample, radius, top, options,
-                                    workers)
-            field = _free_field(problem, sample, radius, n_components, degree,
-                                top, options, workers)
-            if options.degree is None:
-                field = _tamed(field, lambda lower: _free_field(
-                    sample.problem(lower, options.local_bkg), sample, radius,
-                    n_components, lower, lower, options, workers))
-        if options.normalise == 'stamps':
-            return field
-        return _with_wings(field, sample, read_exposures(*given),
-                           options.normalise)
+        field = field_of_stars(*given, options, **how)
+        if options.start is None and isinstance(options.n_components, int):
+            warn_of_few(field, lambda n: field_of_stars(*given, replace(
+                options, n_components=n, degree=field.degree,
+                normalise='stamps'), **how), stacklevel=3)
+    return field
+
+
+def field_of_stars(data, stars, error, mask, options, *, executor=None,
+                   progress_bar=False):
+    """
+    Fit a field as `fit_mixture_field` does, whatever its Gaussians miss.
+
+    Parameters
+    ----------
+    data, stars, error, mask
+        As there.
+    options : FieldOptions
+    executor : `~concurrent.futures.Executor`, optional
+    progress_bar : bool, optional
+
+    Returns
+    -------
+    MixtureField or TunedMixtureField
+    """
+    given = data, stars, error, mask
+    sample, radius = _read(given, options)
+    if options.correlated_noise:
+        allow_for_correlation(sample)
+    n_components, degree = options.size(sample.n_places)
+    top = possible_degree(degree, sample)
+    problem = sample.problem(top, options.local_bkg)
+    with Workers(executor) as workers, progress(workers, progress_bar):
+        if options.start is not None:
+            return _tuned_field(problem, sample, radius, top, options,
+                                workers)
+        field = _free_field(problem, sample, radius, n_components, degree,
+                            top, options, workers)
+        if options.degree is None:
+            field = _tamed(field, lambda lower: _free_field(
+                sample.problem(lower, options.local_bkg), sample, radius,
+                n_components, lower, lower, options, workers))
+    if options.normalise == 'stamps':
+        return field
+    return _with_wings(field, sample, read_exposures(*given),
+                       options.normalise)
 
 
 def _read(given, options):
@@ -304,7 +333,7 @@ def _tamed(field, refit):
         'as at any star; '
         + (f'degree {lower.degree} is taken, which describes the stars as well'
            if better else 'give a lower degree, such as 1, to measure there'),
-        AstropyUserWarning, stacklevel=3)
+        AstropyUserWarning, stacklevel=4)
     return lower if better else field
 
 
@@ -336,7 +365,7 @@ def _fatter(fit, wanted, workers, reject):
             f'{found.largest * (found.value[0] + found.value[2]) / 2:.4f} '
             f'pix^2 (chi^2 {found.significance:.0f} for 3 numbers); the PSF '
             'is that of faint stars, and brighter_fatter of the field says '
-            'how others differ', AstropyUserWarning, stacklevel=4)
+            'how others differ', AstropyUserWarning, stacklevel=5)
     return fit, found
 
 
@@ -363,7 +392,7 @@ def _with_wings(field, sample, exposures, normalise):
         warnings.warn(
             "normalise='curve-of-growth' found no light beyond the "
             f'stamps, {wings.error:.4f} of the flux at most; nothing was '
-            'added', AstropyUserWarning, stacklevel=3)
+            'added', AstropyUserWarning, stacklevel=4)
     _LOG.info('%.4f +- %.4f of the light of stars is beyond their stamps; it '
               'is in the PSF as one wide Gaussian, and in fluxes',
               wings.share, wings.error)
@@ -473,7 +502,7 @@ def _warn_of_lost(dropped, table):
     warnings.warn(
         f'{len(reasons)} of the {n_stars} stars given are not used ({counts}):'
         ' check that x and y are those of this image, and that error and mask '
-        'are right', AstropyUserWarning, stacklevel=5)
+        'are right', AstropyUserWarning, stacklevel=6)
 
 
 def _context_parts(fit, sample, n_terms):

@@ -225,7 +225,7 @@ def allow_for_correlation(sample):
                     key=lambda one: sum(one.nearest))
     warnings.warn(f'{strongest} The errors of pixels are taken to be '
                   f'{np.sqrt(sample.growth.max()):.2f} times as large.',
-                  AstropyUserWarning, stacklevel=3)
+                  AstropyUserWarning, stacklevel=4)
 
 
 def _check_light(stamps):
@@ -367,7 +367,7 @@ def possible_degree(degree, sample):
     warnings.warn(
         f'{n_stars} {what} are too few for degree {degree}, which needs '
         f'{needed}; degree {possible} is used', AstropyUserWarning,
-        stacklevel=3)
+        stacklevel=4)
     return possible
 
 

@@ -22,20 +22,20 @@ class FieldOptions:
         If one is not valid, or does not go with another.
     """
 
-    n_components: object
-    degree: object
-    radius: float | None
-    local_bkg: bool
-    effective_gain: float | None
-    reject: bool
-    regularization: float
-    start: object
-    centre: str
-    normalise: str
-    pixel_integrated: object
-    correlated_noise: bool
-    contexts: tuple
-    brighter_fatter: object
+    n_components: object = None
+    degree: object = None
+    radius: float | None = None
+    local_bkg: bool = False
+    effective_gain: float | None = None
+    reject: bool = True
+    regularization: float = 1.0
+    start: object = None
+    centre: str = 'core'
+    normalise: str = 'auto'
+    pixel_integrated: object = 'auto'
+    correlated_noise: bool = True
+    contexts: tuple = ()
+    brighter_fatter: object = False
 
     def __post_init__(self):
         checked = {

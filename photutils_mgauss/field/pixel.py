@@ -71,7 +71,7 @@ def warn_of_phase(mixture):
             'pixel, and fluxes with it: the pixels are too coarse for a PSF '
             'that is sampled; use pixel_integrated=True (mgauss psf '
             '--pixel-integrated)', AstropyUserWarning,
-            stacklevel=5)
+            stacklevel=6)
 
 
 def _integrals(rows, x, y):

@@ -1,9 +1,17 @@
 """More Gaussians where the usual number misses too much of the light."""
+import re
+import warnings
+
 import numpy as np
 import pytest
 from astropy.table import Table
+from astropy.utils.exceptions import AstropyUserWarning
 
-from photutils_mgauss import GaussianMixture, fit_mixture_field
+from photutils_mgauss import (
+    EmpiricalPSF,
+    GaussianMixture,
+    fit_mixture_field,
+)
 
 CELL = 24
 
@@ -78,3 +86,23 @@ def test_hundreds_of_stars_of_three_gaussians_do_not_ask_for_eight():
         [0.6, 0.3, 0.1], [[0, 0], [0.2, 0.1], [-0.3, 0.3]],
         [[[1, 0.2], [0.2, 1.3]], [[2.5, -0.5], [-0.5, 3]], [[9, 1], [1, 8]]])
     assert fitted(psf, 18).n_components == 6
+
+
+def test_it_is_said_that_the_number_given_misses_light():
+    psf = GaussianMixture.from_stddevs([0.7, 0.3], np.zeros((2, 2)),
+                                       [(0.95, 0.95), (2.2, 2.2)])
+    with pytest.warns(AstropyUserWarning) as told:
+        field = fitted(psf, n_components=1)
+    assert field.n_components == 1
+    (words,) = [one for one in told if 'misses' in str(one.message)]
+    assert words.filename == __file__
+    assert re.match(r'n_components=1 misses \d+\.\d% of the light in the '
+                    r'pixels of bright stars, n_components=6 0\.\d%',
+                    str(words.message))
+    data, error, stars = image(psf, 8, 1e5)
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        # Two are all there are; pixels add what an empirical PSF misses.
+        assert fitted(psf, n_components=2).accuracy < 0.005
+        EmpiricalPSF.from_stars(data, stars, error=error, n_components=1,
+                                degree=0, radius=8)
