@@ -54,7 +54,9 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
         The degree of the polynomials of the last pass, 0 for a PSF that is
         the same everywhere. 'auto' is the highest degree with at least
         forty stars for each term, at most 4: 2 with 300 stars, 3 with 400.
-        Terms that are not significant are shrunk.
+        With fewer than 120 stars, too few for any slope by this rule, the
+        last fit chooses as `fit_mixture_field` does: it shrinks slopes as
+        far as the stars do not show them, and has the rest in its errors.
     radius : float, optional
         The radius of the circle of fitted pixels around each star [pix]; by
         default 15, and more in proportion for PSFs wider than 3 pixels.

@@ -87,6 +87,11 @@ class LoopOptions:
                 degree -= 1
         return degree
 
+    def has_few(self, field):
+        """Return whether a field is of too few stars for any slope."""
+        return self.degree == 'auto' and self.degree_of(1, len(
+            field.stars)) == 0
+
     def is_last_kind(self, number, degree, n_stars):
         """Tell whether later passes are no deeper, wider or higher."""
         return (number >= max(len(_THRESHOLDS) - 1, len(_RADII))
@@ -255,6 +260,8 @@ def fit_field(pixels, options, solve, effective_gain=None):
             if steady and (change < _REST
                            or (steady > 2 and turns_back(*passes))):
                 _tell_of_few(field, passes[-2], solved, number, options)
+                if options.has_few(field):
+                    field = _of_few(solved, passes[-2], field.radius, options)
                 break
         else:
             warnings.warn(
@@ -347,12 +354,18 @@ def next_field(image, field, number, options, solve):
                               _MOST_ERROR))
     solved = Solved.with_psf(image, psf, solve, threshold=threshold,
                              depth=threshold, psf_error=psf_error)
-    stars = psf_stars.judge(solved.table, solved.variance,
-                            max(field.accuracy, _LEAST_ERROR), rules)
-    _check_number(stars, rules)
+    stars = _judged(solved, field, rules)
     used = stars[stars['selected']]
     new = _fit(solved, psf, used, number, options)
     return _with_reasons(new, stars), solved
+
+
+def _judged(solved, field, rules):
+    """Return the bright stars of an image solved with a field."""
+    stars = psf_stars.judge(solved.table, solved.variance,
+                            max(field.accuracy, _LEAST_ERROR), rules)
+    _check_number(stars, rules)
+    return stars
 
 
 def _fit(solved, psf, used, number, options):
@@ -365,12 +378,32 @@ def _fit(solved, psf, used, number, options):
             effective_gain=np.inf, normalise='stamps'))
 
 
+def _of_few(solved, before, radius, options):
+    """
+    Return the field of few stars as that of an image without neighbours.
+
+    It has what few stars tell of slopes, and in its errors what they do not.
+    """
+    stars = _judged(solved, before, options.rules)
+    used, n = stars[stars['selected']], options.n_components
+    return _with_reasons(field_of_stars(
+        solved.with_stars(grid_of(before), used), used,
+        np.sqrt(solved.variance), None, FieldOptions(
+            None if n == LoopOptions.n_components else n, None, radius,
+            effective_gain=np.inf, normalise='stamps')), stars)
+
+
+def _used(field):
+    """Return the stars of a field that were used, as a list to fit."""
+    used = field.stars['x_fit', 'y_fit', 'flux_fit'][field.stars['used']]
+    used.rename_columns(used.colnames, ['x', 'y', 'flux'])
+    return used
+
+
 def _tell_of_few(field, before, solved, number, options):
     """Warn if fewer Gaussians than usual miss light that more would have."""
     def refit(n):
-        used = field.stars['x_fit', 'y_fit', 'flux_fit'][field.stars['used']]
-        used.rename_columns(used.colnames, ['x', 'y', 'flux'])
-        return _fit(solved, grid_of(before), used, number, replace(
+        return _fit(solved, grid_of(before), _used(field), number, replace(
             options, n_components=n, degree=field.degree))
     warn_of_few(field, refit, stacklevel=6)
 

@@ -297,8 +297,29 @@ def test_the_loop_ends_where_the_psf_no_longer_goes_one_way(
             '_with_unit': lambda field, _: field}.items():
         monkeypatch.setattr(psf_loop, name, instead)
     pixels = read_pixels(np.ones((9, 9)), np.ones((9, 9)))
-    found = psf_loop.fit_field(pixels, psf_loop.LoopOptions(), None, 1.0)
+    found = psf_loop.fit_field(pixels, psf_loop.LoopOptions(degree=0), None,
+                               1.0)
     assert found is fields[n_passes]
+
+
+@pytest.mark.long
+def test_few_stars_tell_what_they_can_of_slopes():
+    n, rng = 240, np.random.default_rng(2)
+    psf = csst_psf((n, n), 'i', rng=2)
+    x, y = rng.uniform(0, n, (2, 160))
+    flux = 10**np.append(rng.uniform(4, 5.3, 30), rng.uniform(2.3, 3.6, 130))
+    light = render_stars(psf, x, y, flux, (n, n)) + 60
+    data, error = rng.normal(light, np.sqrt(light)), np.sqrt(light)
+    listed = Table({'x': x, 'y': y, 'flux': flux})
+    scatter = []
+    for degree in (0, 'auto'):
+        field = fit_crowded_psf(data, error=error, degree=degree)
+        table = CrowdedMixturePhotometry(field)(
+            data, error=error, init_params=listed)[:30]
+        scatter.append(np.std(table['x_fit'] - x[:30])
+                       + np.std(table['y_fit'] - y[:30]))
+    assert field.degree > 0
+    assert scatter[1] < 0.6 * scatter[0]
 
 
 @unfinished
