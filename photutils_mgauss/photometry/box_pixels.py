@@ -38,9 +38,11 @@ class ScaledImage:
     def whole(self):
         """Return a copy of all pixels as kernels take it; ``light`` stays."""
         pixels = self.pixels
-        return kernel_image(
-            pixels.data / self.unit, None if pixels.error is None
-            else pixels.error / self.unit, pixels.mask)
+        data, error = pixels.data / self.unit, pixels.error
+        if error is not None:
+            data[_without_error(error)] = np.nan
+            error = error / self.unit
+        return kernel_image(data, error, pixels.mask)
 
     def values(self, at):
         """Return the pixels at an index, NaN for those that are not used."""
@@ -66,7 +68,7 @@ class ScaledImage:
         Returns
         -------
         `~photutils_mgauss.kernels.GroupPixels`
-            Of less than no pixels where an error is not positive and finite.
+            Pixels whose error is not positive and finite are not used.
         """
         n, m = boxes.shape[:2]
         flat, pixels = boxes.reshape(-1, 4), self.pixels
@@ -75,6 +77,8 @@ class ScaledImage:
             data[_taken(pixels.mask, flat) > 0] = np.nan
         error = (np.full(data.shape, self.unit) if pixels.error is None
                  else _taken(pixels.error, flat))
+        bad = _without_error(error)
+        data[bad], error[bad] = np.nan, self.unit
         light = (np.empty((0, 0, 0)) if self.light is None
                  else _taken(self.light, flat).reshape(n, m, -1))
         out = kernels.GroupPixels(
@@ -84,6 +88,10 @@ class ScaledImage:
             out, light, self.unit, np.empty((0, m, 3)) if own is None else
             own, psf, kernels.BoxScratch.empty(m, flat).around)
         return out
+
+
+def _without_error(error):
+    return ~((error > 0) & np.isfinite(error))
 
 
 def _taken(image, boxes):

@@ -336,7 +336,7 @@ def joint_images(pixels, psfs, shared, *, fit_sky, factors=None):
     scale = float(np.median([
         _typical(one.with_error().error) * factor
         for one, factor in zip(pixels, factors, strict=True)]))
-    images = [ScaledImage(one.with_bad_masked(), scale / factor)
+    images = [ScaledImage(one, scale / factor)
               for one, factor in zip(pixels, factors, strict=True)]
     return JointImages(images, [psf_arrays(psf) for psf in psfs],
                        np.asarray(shared), fit_sky), scale

@@ -74,16 +74,6 @@ class PixelData:
         return replace(self, error=np.broadcast_to(noise, self.shape),
                        estimated=True)
 
-    def with_bad_masked(self):
-        """Return the image with pixels masked whose error is no number > 0."""
-        if self.error is None:
-            return self
-        bad = ~((self.error > 0) & np.isfinite(self.error))
-        if not bad.any():
-            return self
-        return replace(self, mask=bad if self.mask is None
-                       else bad | self.mask)
-
     def part(self, window=np.s_[:, :]):
         """Return data and variance of a window, both 0 at bad pixels."""
         data, error = (np.array(image[window], float, order='C')

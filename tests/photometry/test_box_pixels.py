@@ -89,13 +89,15 @@ def test_own_light_is_added_to_both_boxes_of_a_pair(rng):
 
 
 @pytest.mark.parametrize('error', [0, -1, np.nan, np.inf])
-def test_an_error_that_is_none_is_told_unless_it_is_masked(error):
+def test_pixels_with_an_error_that_is_none_are_not_used(error):
     data, errors = np.zeros((20, 20)), np.ones((20, 20))
     errors[10, 10] = error
     boxes = cut_boxes(np.array([10.0]), np.array([11.0]), (5, 5), (20, 20))
-    for mask, n in ((None, -1), (errors != 1, 24)):
+    for mask in (None, errors != 1):
         image = ScaledImage(PixelData(data, errors, mask), 1.0)
-        assert image.groups(boxes[None], None, PLAIN).n_pixels[0] == n
+        assert image.groups(boxes[None], None, PLAIN).n_pixels[0] == 24
+        whole = image.whole()
+        assert np.isnan(whole.data[10, 10]) or whole.mask[10, 10]
 
 
 def test_the_images_of_a_fit_are_those_of_the_user(rng):
