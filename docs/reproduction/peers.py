@@ -5,11 +5,12 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
-from astropy.table import Table
+from astropy.table import Table, vstack
 
 from photutils_mgauss import read_psfex
 
@@ -29,6 +30,9 @@ INSTALL = {
 _COLUMNS = ('X_IMAGE', 'Y_IMAGE', 'XWIN_IMAGE', 'YWIN_IMAGE', 'FLUX_AUTO',
             'FLUX_APER(1)', 'FLUXERR_APER(1)', 'FLUX_RADIUS', 'SNR_WIN',
             'ELONGATION', 'FLAGS')
+# Of the parts of an image that crowdsource is given, at most, and by how much
+# they reach beyond their own stars [pix].
+SIDE, OVERLAP = 640, 20
 _FILTER = ('CONV NORM\n1 2 1\n2 4 2\n1 2 1\n')
 
 
@@ -171,12 +175,43 @@ def windowed(data, x, y):
 
 
 def crowdsource(python, data, error, mask, grid):
-    """Run crowdsource, in another interpreter, with a grid of mixtures."""
+    """
+    Run crowdsource, in another interpreter, with a grid of mixtures.
+
+    Large images are given in parts that overlap: it needs more than 23 GB
+    for one of 2308 x 2304 pixels. Of each part the stars count that are
+    nearer to its middle than to that of its neighbours.
+    """
     _require('crowdsource', _crowdsource_version(python))
+    lists = []
+    for rows in _spans(data.shape[0]):
+        for columns in _spans(data.shape[1]):
+            seen = tuple(slice(max(a - OVERLAP, 0), b + OVERLAP)
+                         for a, b in (rows, columns))
+            found = _crowdsource(python, data[seen], error[seen], mask[seen],
+                                 grid, (seen[1].start, seen[0].start))
+            # Beyond the edges of the image are stars of the outer parts.
+            own = [(found[name] >= (a - 0.5 if a else -np.inf))
+                   & (found[name] < (b - 0.5 if b < n else np.inf))
+                   for name, (a, b), n in (('y', rows, data.shape[0]),
+                                           ('x', columns, data.shape[1]))]
+            lists.append(found[own[0] & own[1]])
+    return vstack(lists)
+
+
+def _spans(length):
+    """Return first and last pixel, exclusive, of equal parts of an axis."""
+    edges = np.linspace(0, length, -(-length // SIDE) + 1).astype(int)
+    return list(pairwise(edges.tolist()))
+
+
+def _crowdsource(python, data, error, mask, grid, origin):
+    """Run crowdsource on a part whose first pixel is at origin, x and y."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         mixtures = grid.mixtures
-        np.savez(folder / 'in.npz', data=data, places=grid.grid_xypos,
+        np.savez(folder / 'in.npz', data=data,
+                 places=np.subtract(grid.grid_xypos, origin),
                  weight=np.where(mask, 0, 1 / error),
                  weights=[m.weights for m in mixtures],
                  means=[m.means for m in mixtures],
@@ -185,4 +220,5 @@ def crowdsource(python, data, error, mask, grid):
         subprocess.run([python or sys.executable, script, folder / 'in.npz',
                         folder / 'out.npz'], check=True, capture_output=True)
         with np.load(folder / 'out.npz') as out:
-            return Table({key: out[key] for key in ('x', 'y', 'flux')})
+            return Table({'x': out['x'] + origin[0],
+                          'y': out['y'] + origin[1], 'flux': out['flux']})
