@@ -81,19 +81,16 @@ def _add_own(boxes, own, psf, scratch, data):
 
 @inner
 def _weigh_box(data, weights, light, unit):
-    """Scale the pixels of a box and weigh them; return whether all can be."""
+    """Scale the pixels of a box and weigh them."""
     for k in range(data.size):
-        if not abs(data[k]) < np.inf:
+        if not (abs(data[k]) < np.inf and 0 < weights[k] < np.inf):
             data[k] = 0.0
             weights[k] = 0.0
             continue
-        if not 0 < weights[k] < np.inf:
-            return False
         data[k] /= unit
         if light.size:
             data[k] -= light[k]
         weights[k] = (unit / weights[k]) ** 2
-    return True
 
 
 @kernel
@@ -102,12 +99,11 @@ def weigh_groups(pixels, light, unit, own, psf, scratch):
     Turn pixels as they are in an image into those of a fit.
 
     The data of pixels are in the unit of the image, infinite or NaN where
-    they do not count, and the weights are errors. Both are put into a unit of
-    light that is 1 there. light (g, m, area), or (0, 0, 0) for none, is what
-    is to be subtracted then, and own (g, m, 3), or (0, m, 3), light of stars
-    (flux, x, y) to add. Pixels that boxes of a group share count once. The
-    number of pixels is -1 where an error is not positive and finite. scratch
-    is a Scratch.
+    they do not count, and the weights are errors, positive and finite where
+    they count. Both are put into a unit of light that is 1 there. light (g,
+    m, area), or (0, 0, 0) for none, is what is to be subtracted then, and own
+    (g, m, 3), or (0, m, 3), light of stars (flux, x, y) to add. Pixels that
+    boxes of a group share count once. scratch is a Scratch.
     """
     nothing = light[:0, 0, 0]
     for g in range(pixels.boxes.shape[0]):
@@ -116,12 +112,9 @@ def weigh_groups(pixels, light, unit, own, psf, scratch):
         n = 0
         for c in range(boxes.shape[0]):
             used = boxes[c, 2] * boxes[c, 3]
-            sound = _weigh_box(
+            _weigh_box(
                 pixels.data[g, c, :used], pixels.weights[g, c, :used],
                 light[g, c, :used] if light.size else nothing, unit)
-            if not sound:
-                pixels.n_pixels[g] = -1
-                return
         if own.shape[0]:
             _add_own(boxes, own[g], psf, scratch, pixels.data[g])
         for c in range(boxes.shape[0]):

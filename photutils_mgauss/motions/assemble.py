@@ -163,6 +163,8 @@ class Sightings:
         years = self.years[self.kept]
         own = np.nanmax(years) - np.nanmin(years)
         return bool(own <= period(self.baseline))
+
+
 def mean_years(years):
     """Return the mean years (E,) of epochs, from (E, 1) or (E, n)."""
     return years[:, 0] if years.shape[1] == 1 else np.nanmean(years, axis=1)

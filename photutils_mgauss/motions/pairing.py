@@ -222,9 +222,9 @@ def _start(catalogue):
 
 def _match_one(master, places, sigma, year, tolerance, chip):
     """
-    Return the star of each row, adding the rows that are new stars.
+    Return the star of each row, and the tolerance that is not from errors.
 
-    And the part of the tolerance that is not from errors.
+    Rows that are new stars are added.
     """
     stars, slack = np.full(places.shape[1], -1), 0.0
     finite = np.flatnonzero(np.isfinite(places).all(axis=0))

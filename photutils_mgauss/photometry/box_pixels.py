@@ -40,7 +40,7 @@ class ScaledImage:
         pixels = self.pixels
         data, error = pixels.data / self.unit, pixels.error
         if error is not None:
-            data[_without_error(error)] = np.nan
+            data[~((error > 0) & np.isfinite(error))] = np.nan
             error = error / self.unit
         return kernel_image(data, error, pixels.mask)
 
@@ -77,8 +77,6 @@ class ScaledImage:
             data[_taken(pixels.mask, flat) > 0] = np.nan
         error = (np.full(data.shape, self.unit) if pixels.error is None
                  else _taken(pixels.error, flat))
-        bad = _without_error(error)
-        data[bad], error[bad] = np.nan, self.unit
         light = (np.empty((0, 0, 0)) if self.light is None
                  else _taken(self.light, flat).reshape(n, m, -1))
         out = kernels.GroupPixels(
@@ -88,10 +86,6 @@ class ScaledImage:
             out, light, self.unit, np.empty((0, m, 3)) if own is None else
             own, psf, kernels.BoxScratch.empty(m, flat).around)
         return out
-
-
-def _without_error(error):
-    return ~((error > 0) & np.isfinite(error))
 
 
 def _taken(image, boxes):
