@@ -80,6 +80,7 @@ def test_catalogues_of_one_file_are_one_exposure(camera, capsys):
         assert (folder / 'out' / f'{name}_wcs.fits').is_file()
 
 
+@pytest.mark.long
 def test_the_report_shows_each_chip_and_the_references(camera, tmp_path,
                                                        monkeypatch):
     pytest.importorskip('matplotlib')
@@ -151,6 +152,7 @@ def test_catalogues_that_know_no_image_are_refused(camera, tmp_path, capsys):
     assert 'which knows its image' in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_images_of_several_chips_become_motions(tmp_path, capsys):
     rng = np.random.default_rng(8)
     field = make_field(rng, columns=2, rows=1, per_chip=1, size=0.0)

@@ -228,6 +228,7 @@ def test_images_become_motions_in_one_command(chain):
                    'pipeline')
 
 
+@pytest.mark.long
 def test_a_crowded_measurement_finds_the_same_stars(chain, monkeypatch):
     monkeypatch.chdir(chain)
     assert main(['photometry', 'images/night1.fits', '--psf',

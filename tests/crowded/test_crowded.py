@@ -291,6 +291,7 @@ def test_the_table_has_the_columns_of_photutils(fitted):
     assert (np.abs(fitted['neighbor_correlation']) <= 1).all()
 
 
+@pytest.mark.long
 def test_tiles_do_not_change_a_star():
     rng = np.random.default_rng(8)
     n = 1800

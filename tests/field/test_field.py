@@ -308,6 +308,7 @@ def test_neighbours_are_fitted_along(rng):
     assert_allclose(field.stars['flux_fit'] / flux, 1, atol=0.04)
 
 
+@pytest.mark.long
 def test_the_executor_does_not_change_the_result(stars, clean):
     arguments = {'error': np.full(SHAPE, 5.0), 'n_components': 1, 'degree': 1}
     with ThreadPoolExecutor(1) as executor:
@@ -329,6 +330,7 @@ def test_the_nine_stars_of_daophots_image_are_found(realdata):
         assert np.sqrt(np.mean((offset - np.mean(offset)) ** 2)) < 0.04
 
 
+@pytest.mark.long
 def test_left_out_stars_choose_degree_and_number_of_gaussians(stars, clean):
     data, error, _ = noisy(clean, np.random.default_rng(5))
     field = fit_mixture_field(data, stars[::2], error=error,

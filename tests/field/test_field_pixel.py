@@ -147,6 +147,7 @@ def test_wide_stars_are_sampled_and_agree_with_integrated_ones():
         assert_allclose(one - one.mean(), other - other.mean(), atol=5e-4)
 
 
+@pytest.mark.long
 def test_a_ring_of_light_does_not_decide_the_core():
     turn = 2 * np.pi * np.arange(12) / 12
     ring = 2.2 * np.column_stack([np.cos(turn), np.sin(turn)])
@@ -174,6 +175,7 @@ def test_a_bar_shows_what_is_being_fitted(capsys, monkeypatch):
     assert 'all stars' in shown
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('share', [0.02, 0.05])
 def test_light_in_the_wrong_pixels_is_noticed(share):
     assert fitted(misfit=share).accuracy == pytest.approx(share, rel=0.25)
@@ -206,6 +208,7 @@ def test_stars_have_the_errors_that_light_in_the_wrong_pixels_makes():
             np.sqrt(np.mean(table[f'{name}_psf_err'] ** 2)), rel=0.2)
 
 
+@pytest.mark.long
 def test_files_keep_how_much_light_is_in_the_wrong_pixels(tmp_path):
     psf = fitted(misfit=0.03).to_grid((2, 2))
     psf.write(tmp_path / 'psf.fits')
