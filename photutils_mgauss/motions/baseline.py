@@ -110,7 +110,8 @@ def few_in_common(seen, stars, catalogue):
     return tuple(
         f'Only {some} of the {total} stars of epoch {e} were found in another '
         'epoch: if there should be more, its pointing may be off by more '
-        'than matching looks for; see match_by and match_radius.'
+        'than matching looks for (see match_by and match_radius), or stars '
+        'may move faster than max_motion.'
         for e, (some, total) in enumerate(zip(shared, seen.sum(axis=1),
                                               strict=True))
         if some < COMMON * total)
@@ -138,5 +139,6 @@ def few_references(places, known, catalogue):
     words = (f'Only {found.sum()} of the {inside.sum()} reference objects '
              'in the field were found among the stars of the epoch: if there '
              'should be more, its pointing may be off by more than matching '
-             'looks for; see match_by and match_radius.')
+             'looks for (see match_by and match_radius), or objects without '
+             'a known motion may move faster than max_motion.')
     return (words,)
