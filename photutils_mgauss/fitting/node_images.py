@@ -10,7 +10,11 @@ from photutils.psf import ImagePSF
 from photutils_mgauss.files.epsfs import places_in_meta
 from photutils_mgauss.files.psfex import read_psfex
 from photutils_mgauss.utils import compat
-from photutils_mgauss.utils.validation import as_floats, as_grid_shape
+from photutils_mgauss.utils.validation import (
+    as_floats,
+    as_grid_shape,
+    shown,
+)
 
 __all__ = ['NodeImages', 'of_gridded_psf', 'of_image_psf', 'of_psfex']
 
@@ -233,7 +237,7 @@ def _image_psfs(psf):
     psfs = [getattr(one, 'epsf', one) for one in (psf if several else [psf])]
     for one in psfs:
         if not isinstance(one, ImagePSF):
-            msg = f'psf must be made of ImagePSF models, got {one!r:.80}'
+            msg = f'psf must be made of ImagePSF models, got {shown(one)}'
             raise TypeError(msg)
         pairs = [(getattr(one, name), getattr(psfs[0], name))
                  for name in ('origin', 'oversampling')]

@@ -4,6 +4,7 @@ import numpy as np
 
 from photutils_mgauss.sky.tangent_plane import MAS, local_axes, unit_vectors
 from photutils_mgauss.utils.star_columns import find_column, first_values
+from photutils_mgauss.utils.validation import shown
 
 # Columns with more names than one, in order of preference.
 COLUMNS = {
@@ -53,7 +54,7 @@ def identifiers(table):
     values, counts = np.unique(ids, return_counts=True)
     if len(values) < len(ids):
         msg = (f"the column 'id' must hold unique values, got "
-               f'{values[counts > 1][0]!r} {counts.max()} times')
+               f'{shown(values[counts > 1][0])} {counts.max()} times')
         raise ValueError(msg)
     return ids
 

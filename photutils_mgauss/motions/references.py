@@ -19,6 +19,7 @@ from photutils_mgauss.motions.stacked import apply
 from photutils_mgauss.sky.observers import julian_years
 from photutils_mgauss.sky.space_motion import carried
 from photutils_mgauss.utils.star_columns import find_column
+from photutils_mgauss.utils.validation import shown
 
 CLASSES = ('qso', 'galaxy', 'star', 'position')
 FIXED = ('qso', 'galaxy')  # neither move nor have a parallax
@@ -148,7 +149,7 @@ def _kinds(table):
         if bad.any():
             words = ', '.join(repr(kind) for kind in CLASSES)
             msg = (f"the column 'class' of references must hold {words}, "
-                   f'got {kinds[bad][0]!r}')
+                   f'got {shown(kinds[bad][0])}')
             raise ValueError(msg)
         return kinds
     known = np.isfinite(numbers(table, 'pmra') + numbers(table, 'pmdec'))

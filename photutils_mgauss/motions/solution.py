@@ -37,7 +37,7 @@ from photutils_mgauss.motions.tables import (
 from photutils_mgauss.sky.observers import ANY_YEAR, julian_years, tdb
 from photutils_mgauss.utils.flags import decode
 from photutils_mgauss.utils.notebook import with_table
-from photutils_mgauss.utils.validation import as_integer
+from photutils_mgauss.utils.validation import as_integer, shown
 from photutils_mgauss.utils.waiting import waiting
 
 
@@ -519,7 +519,7 @@ def _numbers_of(ids, names):
     names = np.asarray(names)
     missing = ~np.isin(ids, names)
     if missing.any():
-        msg = f'ids must be those of stars, got {ids[missing][0]!r}'
+        msg = f'ids must be those of stars, got {shown(ids[missing][0])}'
         raise ValueError(msg)
     order = np.argsort(names)
     return order[np.searchsorted(names, ids, sorter=order)]

@@ -51,7 +51,7 @@ from photutils_mgauss.sky.wcs import (
 from photutils_mgauss.utils.image import read_pixels
 from photutils_mgauss.utils.saturation import without_saturated
 from photutils_mgauss.utils.star_columns import check_table, column_values
-from photutils_mgauss.utils.validation import as_shape
+from photutils_mgauss.utils.validation import as_shape, shown
 from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['add_sky_positions', 'fit_many', 'to_flux_densities']
@@ -516,7 +516,7 @@ def _read_any(entry):
         return entry.pixels, entry.model, entry.wcs
     if not isinstance(entry, (tuple, list)) or len(entry) != 3:
         msg = ('images must hold (data, psf, wcs) or ImageEpoch, got '
-               f'{entry!r:.80}')
+               f'{shown(entry)}')
         raise TypeError(msg)
     data, psf, wcs = entry
     check_celestial(wcs)
@@ -567,8 +567,8 @@ def add_motions(table, grid, columns, rows, covariance, rates, year):
 
 def _read_image(entry):
     """Return the pixels, PSF, WCS and unit of one (data, psf, wcs)."""
-    if len(entry) != 3:
-        msg = f'images must hold (data, psf, wcs), got {len(entry)} things'
+    if not isinstance(entry, (tuple, list)) or len(entry) != 3:
+        msg = f'images must hold (data, psf, wcs), got {shown(entry)}'
         raise ValueError(msg)
     data, psf, wcs = entry
     check_celestial(wcs)

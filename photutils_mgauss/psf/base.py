@@ -90,9 +90,12 @@ class PSFModel(Fittable2DModel):
     def _described(self, details=''):
         """Return the text of ``repr``; details stand before the number."""
         pixel = ', pixel_integrated=True' if self._pixel_integrated else ''
-        return (f'<{type(self).__name__}(flux={self.flux.value:g}, '
-                f'x_0={self.x_0.value:g}, y_0={self.y_0.value:g}, {details}'
-                f'n_components={self.n_components}{pixel})>')
+        flux, x_0, y_0 = (np.array2string(
+            np.asarray(one.value), separator=', ', threshold=6,
+            formatter={'float_kind': '{:g}'.format})
+            for one in (self.flux, self.x_0, self.y_0))
+        return (f'<{type(self).__name__}(flux={flux}, x_0={x_0}, y_0={y_0}, '
+                f'{details}n_components={self.n_components}{pixel})>')
 
     @property
     def pixel_integrated(self):

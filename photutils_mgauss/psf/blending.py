@@ -1,8 +1,10 @@
 """Several mixtures mixed into one."""
+from collections.abc import Iterable
+
 import numpy as np
 
 from photutils_mgauss.psf.mixture import GaussianMixture
-from photutils_mgauss.utils.validation import as_floats
+from photutils_mgauss.utils.validation import as_floats, shown
 
 __all__ = ['blend']
 
@@ -37,10 +39,10 @@ def blend(mixtures, fractions):
     >>> blend([narrow, wide], [0.75, 0.25]).weights
     array([0.75, 0.25])
     """
-    mixtures = list(mixtures)
+    mixtures = as_list(mixtures)
     for mixture in mixtures:
         if not isinstance(mixture, GaussianMixture):
-            msg = f'mixtures must be GaussianMixtures, got {mixture!r:.80}'
+            msg = f'mixtures must be GaussianMixtures, got {shown(mixture)}'
             raise TypeError(msg)
     fractions = as_floats(fractions, 'fractions', shape=(len(mixtures),))
     # Only weights change: averaging shapes would pair components whose order
@@ -49,3 +51,13 @@ def blend(mixtures, fractions):
     return GaussianMixture(np.concatenate(weights),
                            np.concatenate([m.means for m in mixtures]),
                            np.concatenate([m.covariances for m in mixtures]))
+
+
+def as_list(mixtures):
+    """Return mixtures as a list, or raise for what is no sequence of them."""
+    if isinstance(mixtures, GaussianMixture) or not isinstance(
+            mixtures, Iterable):
+        msg = ('mixtures must be a list of GaussianMixture objects, got '
+               f'{shown(mixtures)}')
+        raise TypeError(msg)
+    return list(mixtures)

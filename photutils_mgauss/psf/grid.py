@@ -93,6 +93,10 @@ class Grid:
         """Return the indices and bilinear weights (4,) at a position."""
         x, y = (as_floats(value, name, shape=(), finite=False).reshape(1)
                 for value, name in ((x, 'x'), (y, 'y')))
+        for value, name in ((x, 'x'), (y, 'y')):
+            if np.isnan(value).any():
+                msg = f'{name} must not be NaN'
+                raise ValueError(msg)
         i, fx = cells(x, self.x_grid)
         j, fy = cells(y, self.y_grid)
         columns = np.append(i, np.minimum(i + 1, self.x_grid.size - 1))

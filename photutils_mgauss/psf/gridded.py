@@ -24,6 +24,7 @@ from photutils_mgauss.psf.base import (
     split_flux,
     with_unit,
 )
+from photutils_mgauss.psf.blending import as_list
 from photutils_mgauss.psf.contexts import (
     PSFContext,
     at_values,
@@ -140,7 +141,7 @@ n_components=1)>
     def __init__(self, mixtures, grid_xypos, *, flux=1, x_0=0, y_0=0,
                  pixel_integrated=False, scales=None, interpolation='blend',
                  outside='clamp', errors=None, contexts=(), **kwargs):
-        mixtures = list(mixtures)
+        mixtures = as_list(mixtures)
         grid, order = make_grid(mixtures, grid_xypos, scales)
         self._set_up(grid, pixel_integrated, interpolation, outside, errors,
                      contexts)

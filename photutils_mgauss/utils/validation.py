@@ -21,6 +21,13 @@ _WIDEST = 10**6
 _MOST_NODES = 10**5
 
 
+def shown(value):
+    """Return how messages show a value: one line, at most 80 characters."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    return ' '.join(repr(value).split())[:80]
+
+
 def in_pixels(value, name):
     """
     Return numbers without unit, and masked ones as NaN.
@@ -50,7 +57,7 @@ def real_array(value, name):
         if array.dtype.kind != 'c':
             return array.astype(np.float64, copy=False)
     except (TypeError, ValueError, OverflowError) as error:
-        msg = f'{name} must be an array of numbers, got {value!r:.80}'
+        msg = f'{name} must be an array of numbers, got {shown(value)}'
         raise TypeError(msg) from error
     msg = f'{name} must be real, got complex numbers'
     raise TypeError(msg)
@@ -96,7 +103,7 @@ def as_columns(**values):
 def as_real(value, name, *, above=None, minimum=None, maximum=None):
     """Return ``value`` as a finite float within the limits given."""
     if isinstance(value, bool) or not isinstance(value, (Real, np.ndarray)):
-        msg = f'{name} must be a number, got {value!r:.80}'
+        msg = f'{name} must be a number, got {shown(value)}'
         raise TypeError(msg)
     value = float(value)
     if not np.isfinite(value):
@@ -110,7 +117,7 @@ def as_real(value, name, *, above=None, minimum=None, maximum=None):
 def as_integer(value, name, *, minimum=None, maximum=None):
     """Return ``value`` as an int within the limits given."""
     if isinstance(value, bool) or not isinstance(value, Integral):
-        msg = f'{name} must be an integer, got {value!r:.80}'
+        msg = f'{name} must be an integer, got {shown(value)}'
         raise TypeError(msg)
     _check_limits(value, name, None, minimum,
                   _LONGEST if maximum is None else maximum)
@@ -133,7 +140,7 @@ def as_shape(value, name, *, minimum=1):
     """Return ``value``, an int or a pair of ints, as the tuple (ny, nx)."""
     pair = tuple(value) if isinstance(value, Iterable) else (value, value)
     if len(pair) != 2:
-        msg = f'{name} must be one integer or two (ny, nx), got {value!r:.80}'
+        msg = f'{name} must be one integer or two (ny, nx), got {shown(value)}'
         raise ValueError(msg)
     return tuple(as_integer(n, name, minimum=minimum, maximum=_WIDEST)
                  for n in pair)
@@ -154,7 +161,7 @@ def check_callables(options, names):
     for name in names:
         value = options.get(name)
         if not (value is None or callable(value)):
-            msg = f'{name} must be callable or None, got {value!r:.80}'
+            msg = f'{name} must be callable or None, got {shown(value)}'
             raise TypeError(msg)
 
 
@@ -162,7 +169,7 @@ def as_choice(value, name, choices):
     """Return ``value`` if it is one of ``choices``."""
     if value not in choices:
         words = ', '.join(repr(choice) for choice in choices)
-        msg = f'{name} must be one of {words}, got {value!r}'
+        msg = f'{name} must be one of {words}, got {shown(value)}'
         raise ValueError(msg)
     return value
 
@@ -173,7 +180,7 @@ def as_rng(value, name='rng'):
         return np.random.default_rng(value)
     except (TypeError, ValueError) as error:
         msg = (f'{name} must be None, a numpy Generator, or a seed of '
-               f'non-negative integers, got {value!r:.80}')
+               f'non-negative integers, got {shown(value)}')
         raise type(error)(msg) from error
 
 

@@ -210,6 +210,24 @@ def test_bad_positions_are_named(places, message):
         GriddedMixturePSF(mixtures, places)
 
 
+def test_one_mixture_instead_of_a_list_is_named():
+    mixture = some_mixture(np.random.default_rng(1))
+    with pytest.raises(TypeError, match='mixtures must be a list of Gauss'):
+        GriddedMixturePSF(mixture, [(0, 0)])
+    with pytest.raises(TypeError, match='mixtures must be a list of Gauss'):
+        blend(mixture, [1])
+
+
+@pytest.mark.parametrize('interpolation', ['blend', 'components'])
+def test_there_is_no_psf_at_nan(interpolation):
+    psf = make_grid(interpolation=interpolation)
+    for call in (psf.mixture_at, psf.scale_at):
+        with pytest.raises(ValueError, match='x must not be NaN'):
+            call(np.nan, 3)
+        with pytest.raises(ValueError, match='y must not be NaN'):
+            call(3, np.nan)
+
+
 def test_bad_mixtures_and_scales_are_named():
     mixture = some_mixture(np.random.default_rng(1))
     with pytest.raises(TypeError, match='mixtures must be GaussianMixture'):

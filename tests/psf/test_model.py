@@ -380,3 +380,10 @@ def test_the_one_that_photutils_puts_into_all_parameters_is_taken():
     assert np.isfinite(model(1, 1))
 
 
+
+
+def test_the_text_of_a_model_of_several_stars_has_all_fluxes():
+    mixture = GaussianMixture([1], [(0, 0)], [np.eye(2)])
+    model = MultiGaussianPSFModel(mixture, flux=[1.5, 2], x_0=[1, 2], y_0=3)
+    assert repr(model) == ('<MultiGaussianPSFModel(flux=[1.5, 2], '
+                           'x_0=[1, 2], y_0=3, n_components=1)>')
