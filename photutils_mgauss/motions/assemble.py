@@ -8,6 +8,7 @@ from astropy.table import Table
 from photutils_mgauss.motions.baseline import (
     check_baseline,
     check_common,
+    check_rows,
     few_in_common,
     few_references,
     period,
@@ -185,6 +186,7 @@ def assemble(epochs, references, how, transform, wanted=()):
     plane, unit = lists.plane, lists.unit
     catalogue = None if table is None else read_catalogue(table, plane, unit)
     check_baseline([epoch.mean_year for epoch in epochs], catalogue)
+    idle = check_rows(lists.detections, catalogue)
     on_sky = np.array([epoch.is_sky for epoch in epochs])
     orient = partial(find_maps, epochs, lists.detections, catalogue,
                      None if table is None else brightness(table))
@@ -200,7 +202,7 @@ def assemble(epochs, references, how, transform, wanted=()):
     stars, given = known[known >= 0], catalogue
     catalogue = (quasars(len(stars)) if given is None
                  else given.select(known >= 0))
-    notes = (*lists.notes, *mapped)
+    notes = (*lists.notes, *mapped, *idle)
     if len(epochs) == 1 and len(stars):
         notes += few_references(every.plane[:, 0], known, given)
     check_common(every.found, stars, catalogue)

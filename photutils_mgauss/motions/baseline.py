@@ -71,6 +71,41 @@ def check_baseline(years, catalogue):
     raise ValueError(msg + remedy)
 
 
+def check_rows(detections, catalogue):
+    """
+    Return what is wrong with epochs none of whose rows can be used.
+
+    Parameters
+    ----------
+    detections : list of `~photutils_mgauss.motions.detections.Detections`
+        What the epochs say.
+    catalogue : `~photutils_mgauss.motions.references.Catalogue` or None
+        The reference objects.
+
+    Returns
+    -------
+    tuple of str
+        A sentence for each such epoch.
+
+    Raises
+    ------
+    ValueError
+        If too few other epochs are left for motions.
+    """
+    said = []
+    for e, one in enumerate(detections):
+        if one.usable.any() or not one.usable.size:
+            continue
+        what = ('errors is positive and finite' if one.found.any() else
+                'positions is finite (dec within 90 degrees)')
+        said.append(f'epoch {e}: none of the {one.usable.size} {what}')
+    needed = 2 if catalogue is None or not placed(catalogue).any() else 1
+    if said and sum(one.usable.any() for one in detections) < needed:
+        msg = f'epochs must have rows that can be used; {"; ".join(said)}'
+        raise ValueError(msg)
+    return tuple(f'E{one[1:]}.' for one in said)
+
+
 def check_common(found, stars, catalogue):
     """
     Raise unless some star was found twice.

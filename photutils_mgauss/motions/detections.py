@@ -148,7 +148,7 @@ def _common_plane(vectors):
     total = sum(np.nansum(vector, axis=1) for vector in seen)
     if not total.any():
         msg = ('epochs must have finite positions, got none inside the '
-               'bounding boxes of their WCS')
+               'bounding boxes of their WCS (dec within 90 degrees)')
         raise ValueError(msg)
     return TangentPlane.around(total)
 

@@ -21,7 +21,7 @@ def doubts(fit):
     like any other; only what had to be added to the errors, or to be left
     out, shows it.
     """
-    found = fit.setup.sightings.doubts
+    found = (*fit.setup.sightings.doubts, *_motions_without_errors(fit))
     if fit.setup.options.recipe == 'paper':
         return found
     return (*found, *_large_floor(fit), *_lost_references(fit))
@@ -45,7 +45,7 @@ def unsolved(fit, stars):
 
 def remarks(fit):
     """Return what else is not as it should be, a tuple of str."""
-    return (*_without_errors(fit), *_far_away(fit), *_misfit(fit),
+    return (*_positions_without_errors(fit), *_far_away(fit), *_misfit(fit),
             *_lost_detections(fit), *_unfinished(fit),
             *_no_straight_motions(fit))
 
@@ -65,21 +65,32 @@ def _what(fit):
     return 'stars' if fit.setup.relative else 'reference objects'
 
 
-def _without_errors(fit):
+def _positions_without_errors(fit):
+    on_sky = fit.setup.sightings.plane is not None
+    names = ('ra', 'dec') if on_sky else ('x', 'y')
+    kinds = fit.setup.sightings.catalogue.kinds
+    return _without_errors(fit, 'positions', slice(0, 2), names,
+                           np.ones(len(kinds), dtype=bool))
+
+
+def _motions_without_errors(fit):
+    return _without_errors(fit, 'motions', slice(2, 4), ('pmra', 'pmdec'),
+                           fit.setup.sightings.catalogue.kinds == 'star')
+
+
+def _without_errors(fit, what, rows, names, among):
     """Say what of the catalogue is not used for want of its error."""
     catalogue = fit.setup.sightings.catalogue
-    first = 'ra' if fit.setup.sightings.plane is not None else 'x'
-    moving = catalogue.kinds == 'star'
-    for what, rows, among, column in (
-            ('positions', slice(0, 2), np.ones(len(moving), dtype=bool),
-             f'{first}_error'),
-            ('motions', slice(2, 4), moving, 'pmra_error')):
-        known = among & np.isfinite(catalogue.values[rows]).all(axis=0)
-        variance = np.einsum('kkn->kn', catalogue.covariance)[rows]
-        if known.any() and not (variance[:, known] < NO_ERROR).any():
-            yield (f'The {what} of the reference objects are not used, '
-                   'because the table has no errors of them (a column like '
-                   f'{column!r}).')
+    known = among & np.isfinite(catalogue.values[rows]).all(axis=0)
+    variance = np.einsum('kkn->kn', catalogue.covariance)[rows][:, known]
+    lacking = [name for name, some in zip(names, variance, strict=True)
+               if some.size and not (some < NO_ERROR).any()]
+    if lacking:
+        if len(lacking) == 1:
+            what = f'values of {lacking[0]!r}'
+        yield (f'The {what} of the reference objects are not used, because '
+               'the table has no positive errors of them (a column like '
+               f"'{lacking[0]}_error').")
 
 
 def _far_away(fit):

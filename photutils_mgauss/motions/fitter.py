@@ -243,7 +243,7 @@ def _check_quantity(value, name, *units):
 
 
 def _distortion(value):
-    kind = Transform.parse(value)
+    kind = Transform.parse(value, 'distortion')
     if kind.kind not in ('none', 'affine', 'polynomial'):
         msg = ("distortion must be 'affine', 'poly-n' with a degree n > 0, "
                f'or None, got {value!r}')

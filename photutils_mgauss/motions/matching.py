@@ -62,7 +62,11 @@ class HowToMatch:
         """Return the `Tolerance` in the units of a frame."""
         radius = None
         if self.radius is not None:
-            radius = self.radius.to_value(u.Unit(unit))
+            if not self.radius.unit.is_equivalent(unit):
+                msg = (f'match_radius must be in a unit like {unit}, as the '
+                       f'positions of the epochs are, got {self.radius}')
+                raise ValueError(msg)
+            radius = self.radius.to_value(unit)
         if unit == 'pix':
             return Tolerance(radius, 0.0, 20 * (radius or 0.0))
         pointing = POINTING if radius is None else max(POINTING, 2 * radius)

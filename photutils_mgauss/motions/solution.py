@@ -82,12 +82,11 @@ def solution_of(result, ref_epoch=None):
     corrected, residuals = correct_epochs(result)
     stars = _stars_at(result, year)
     alignment = alignment_table(result, residuals)
-    doubtful = doubts(result)
+    doubtful = (*unsolved(result, stars), *doubts(result))
     for sentence in doubtful:
         warnings.warn(sentence, AstropyUserWarning, stacklevel=3)
-    notes = (*unsolved(result, stars), *doubtful, *remarks(result),
-             *result.frames.undetermined, *result.setup.notes,
-             *result.setup.sightings.notes)
+    notes = (*doubtful, *remarks(result), *result.frames.undetermined,
+             *result.setup.notes, *result.setup.sightings.notes)
     return MotionSolution(stars, corrected, alignment, notes, result)
 
 

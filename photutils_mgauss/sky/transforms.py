@@ -54,8 +54,8 @@ class Transform:
     scale: float = 1.0
 
     @classmethod
-    def parse(cls, name):
-        """Return the transform called ``name``."""
+    def parse(cls, name, option='transform'):
+        """Return the transform called ``name``, the value of an option."""
         if name is None:
             return cls('none')
         if isinstance(name, str):
@@ -65,7 +65,7 @@ class Transform:
             if match and int(match[1]) > 0:
                 return cls('polynomial', int(match[1]))
         words = ', '.join(repr(kind) for kind in KINDS)
-        msg = (f"transform must be one of {words}, 'poly-n' with a degree "
+        msg = (f"{option} must be one of {words}, 'poly-n' with a degree "
                f'n > 0, or None, got {name!r}')
         raise ValueError(msg)
 

@@ -133,8 +133,9 @@ def test_accelerations_take_as_many_epochs_as_the_pages_say(rng, parallax):
             assert (known == (n_epochs >= enough + parallax)).all()
 
 
-def test_notes_say_why_no_star_has_a_motion(rng):
-    solution = ProperMotionFitter(parallax=True).fit(on_the_sky(rng, 2))
+def test_a_warning_and_a_note_say_why_no_star_has_a_motion(rng):
+    with pytest.warns(UserWarning, match='No star has a motion'):
+        solution = ProperMotionFitter(parallax=True).fit(on_the_sky(rng, 2))
     assert solution.notes[0].startswith(
         'No star has a motion: position, motion and parallax take good '
         'detections at 3 times or more')

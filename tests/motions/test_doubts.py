@@ -180,6 +180,27 @@ def test_values_without_errors_are_said_not_to_count(scene, columns, words):
     assert [note for note in solution.notes if note.startswith(words)]
 
 
+@pytest.mark.parametrize('value', [np.nan, -0.1, 0.0])
+@pytest.mark.parametrize('columns', [('pmra',), ('pmra', 'pmdec')])
+def test_motions_without_usable_errors_are_warned_of(scene, columns, value):
+    epochs, catalogue = scene
+    for name in columns:
+        catalogue[f'{name}_error'][:] = value * UNIT
+    _, said = fit(epochs, catalogue)
+    what = 'motions' if len(columns) == 2 else "values of 'pmra'"
+    assert [one for one in said if one.startswith(
+        f'The {what} of the reference objects are not used')
+        and "'pmra_error'" in one]
+
+
+def test_a_solution_without_a_motion_is_warned_of(scene):
+    epochs, _ = scene
+    solution, said = fit(epochs[:2], None, parallax=True)
+    assert not np.isfinite(solution.stars['pmra']).any()
+    assert said[0].startswith('No star has a motion')
+    assert solution.notes.count(said[0]) == 1
+
+
 def test_the_recipe_of_the_paper_has_no_systematic_errors(scene):
     epochs, catalogue = scene
     _, said = fit(epochs, catalogue, recipe='paper')

@@ -24,6 +24,32 @@ def test_epochs_without_common_stars_raise(rng):
         ProperMotionFitter().fit(epochs)
 
 
+@pytest.mark.parametrize(('column', 'value', 'words'), [
+    ('x_err', 0.0, 'epoch 1: none of the 40 errors is positive and finite'),
+    ('y_err', np.nan, 'epoch 1: none of the 40 errors is positive and finite'),
+    ('y_fit', np.nan, 'epoch 1: none of the 40 positions is finite')])
+def test_an_epoch_without_a_usable_row_is_named(rng, column, value, words):
+    epochs, _ = plane_epochs(rng, years=(2020.0, 2024.0))
+    epochs[1].table[column] = value
+    with pytest.raises(ValueError, match=words):
+        ProperMotionFitter().fit(epochs)
+
+
+def test_ra_and_dec_in_the_wrong_order_are_named():
+    ones = np.ones(3)
+    right = Table({'ra': 120 + ones, 'dec': 10 + ones, 'ra_error': ones,
+                   'dec_error': ones})
+    wrong = right.copy()
+    wrong['ra'], wrong['dec'] = right['dec'], right['ra']
+    epochs = [Epoch(table, time=year)
+              for year in (2020.0, 2024.0) for table in (right, wrong)]
+    words = r'none of the 3 positions is finite \(dec within 90 degrees\)'
+    with pytest.raises(ValueError, match=words):
+        ProperMotionFitter().fit([epochs[0], epochs[3]])
+    with pytest.raises(ValueError, match=r'got none .*\(dec within 90 deg'):
+        ProperMotionFitter().fit([epochs[1], epochs[3]])
+
+
 def test_no_time_baseline_raises(rng):
     epochs, _ = plane_epochs(rng, years=(2020.0, 2020.0))
     with pytest.raises(ValueError, match='time baseline'):
@@ -115,6 +141,7 @@ def test_two_epochs_give_motions_without_a_chi_square(rng):
 @pytest.mark.parametrize(('keywords', 'words'), [
     ({'transform': 'banana'}, 'transform must be'),
     ({'transform': 'poly-0'}, 'transform must be'),
+    ({'distortion': 'soup'}, 'distortion must be'),
     ({'recipe': 'soup'}, 'recipe must be'),
     ({'parallax': 'maybe'}, 'parallax must be'),
     ({'systematic': 'some'}, 'systematic must be'),
@@ -240,6 +267,13 @@ def test_wrong_identifiers_of_half_the_stars_do_no_harm(rng, transform):
     assert rms(away - design @ field) < 0.01
     wrong = fit.stars[fit.stars['id'] >= 50]
     assert np.mean(wrong['flags'] & 512 > 0) > 0.9
+
+
+def test_a_radius_in_pixels_is_refused_on_the_sky(rng):
+    epochs = observe(make_truth(rng, n_stars=20, n_qso=20), rng)[:2]
+    with pytest.raises(ValueError, match=r'match_radius must be in a unit '
+                       r'like mas, .* got 1\.0 pix'):
+        ProperMotionFitter(match_by='sky', match_radius=1 * u.pix).fit(epochs)
 
 
 def test_epochs_in_pixels_take_a_radius_and_systematic_errors_in_pixels(rng):

@@ -282,8 +282,10 @@ def test_any_declination_and_rotation_gives_the_motions(dec, rotation):
 
 def test_parallaxes_without_coverage_are_nan(scene):
     _, epochs = scene
-    fit = ProperMotionFitter(transform=None, parallax=True,
-                             systematic=None).fit([epochs[0], epochs[6]])
+    fitter = ProperMotionFitter(transform=None, parallax=True,
+                                systematic=None)
+    with pytest.warns(UserWarning, match='No star has a motion'):
+        fit = fitter.fit([epochs[0], epochs[6]])
     for name in ('pmra', 'pmdec', 'parallax', 'ra_error', 'dec_error'):
         assert np.isnan(fit.stars[name]).all()
     assert (fit.stars['flags'] & 1).all()
