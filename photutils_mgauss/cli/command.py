@@ -65,7 +65,8 @@ def _check_command(parser, word):
              for module in _COMMANDS]
     if word.startswith('-') or word in names:
         return
-    near = get_close_matches(word, names, 1)
+    near = ([name for name in names if name.startswith(word)]
+            or get_close_matches(word, names, 1))
     meant = f' (did you mean {near[0]}?)' if near else ''
     parser.error(f'unknown command: {word}{meant}; there are '
                  f'{", ".join(names)}')

@@ -36,6 +36,29 @@ def check(options):
         raise ValueError(msg)
 
 
+def read_list(path):
+    """
+    Return the table of a list of stars, and their places if it has x and y.
+
+    Raises
+    ------
+    ValueError
+        If the table has no rows, or no places of either kind.
+    """
+    from photutils_mgauss.files.tables import read_table
+    from photutils_mgauss.utils.star_columns import read_sources
+    table, _ = read_table(path)
+    if not len(table):
+        msg = f'{path}: must have at least 1 star, got none'
+        raise ValueError(msg)
+    try:
+        return table, read_sources(table)
+    except ValueError as error:
+        if not set(_SKY) <= set(table.colnames):
+            raise ValueError(tools.no_places(path, table)) from error
+    return table, None
+
+
 class StarList:
     """
     The list that is measured in every image.
@@ -49,23 +72,10 @@ class StarList:
     """
 
     def __init__(self, path, options):
-        from photutils_mgauss.files.tables import read_table
-        from photutils_mgauss.utils.star_columns import read_sources
         self.path, self.options = path, options
-        self.table, _ = read_table(path)
+        self.table, self.pixels = read_list(path)
         say_program(options, path, self.table)
-        if not len(self.table):
-            msg = f'{path}: must have at least 1 star, got none'
-            raise ValueError(msg)
         self.on_sky = set(_SKY) <= set(self.table.colnames)
-        try:
-            self.pixels = read_sources(self.table)
-        except ValueError as error:
-            if not self.on_sky:
-                msg = (f'{path}: must have the columns ra and dec, or x and '
-                       f'y: {error}')
-                raise ValueError(msg) from error
-            self.pixels = None
 
     def in_image(self, image):
         """

@@ -271,6 +271,10 @@ def _seen_in_catalogue(options, path, i):
 def _seen(options, path, table, wcs, time, *, image):
     """Return what was seen, its flagged rows left out."""
     from photutils_mgauss.motions import Epoch
+    from photutils_mgauss.motions.columns import names_of
+    from photutils_mgauss.utils.star_columns import find_column
+    if find_column(table, (*names_of('x'), 'ra')) is None:
+        raise ValueError(tools.no_places(path, table))
     if time is None and 'time' not in table.colnames:
         raise ValueError(_no_time(path))
     table = _usable(table, options.good_flags)

@@ -6,6 +6,7 @@ from photutils_mgauss.cli.progress import Progress
 from photutils_mgauss.cli.psf_stars import (
     check_image,
     check_nodes,
+    check_stars,
     check_start,
     choose,
     fit_options,
@@ -69,8 +70,8 @@ def add_fit(parser):
                        metavar='N', help='largest number of stars (default: '
                        '%(default)s)')
     group.add_argument('--stars', metavar='TABLE',
-                       help='table with x, y of the stars to consider, '
-                            'instead of detection')
+                       help='table with x, y or ra, dec of the stars to '
+                            'consider, instead of detection')
     group.add_argument('--start', metavar='PSF',
                        help='a known PSF, for example from an archive, to '
                             'adjust to the stars; fifteen stars are enough '
@@ -93,6 +94,7 @@ def run(options):
     paths = options.inputs
     tools.check_inputs([*paths, options.stars, options.start])
     check_start(options)
+    check_stars(options)
     tools.check_different(paths)
     if options.together:
         psf_together.run(options)

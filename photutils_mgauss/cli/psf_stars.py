@@ -2,7 +2,6 @@
 import warnings
 
 from photutils_mgauss.cli import tools
-from photutils_mgauss.cli.catalogues import say_program
 
 _RADIUS = 10.0
 # No PSF changes its width by so much over a detector.
@@ -23,6 +22,13 @@ def check_start(options):
         raise ValueError(msg)
 
 
+def check_stars(options):
+    """Raise if the stars to choose from are no list of stars."""
+    if options.stars is not None:
+        from photutils_mgauss.cli.given_stars import read_list
+        read_list(options.stars)
+
+
 def fit_options(options):
     """Return the options of `fit_mixture_field` that are given."""
     from photutils_mgauss.cli.psf_files import read_psf
@@ -39,11 +45,12 @@ def fit_options(options):
 def choose(image, radius, options):
     """Return the stars of an image, with those selected for its PSF."""
     from photutils_mgauss.field.selection import select_psf_stars
-    from photutils_mgauss.files.tables import read_table
     sources = None
     if options.stars is not None:
-        sources, _ = read_table(options.stars)
-        say_program(options, options.stars, sources)
+        from photutils_mgauss.cli.given_stars import StarList
+        given = StarList(options.stars, options)
+        sources = (given.in_image(image) if given.pixels is None
+                   else given.table)
     return select_psf_stars(
         image.without_sky, sources, error=image.noise.total, mask=image.mask,
         radius=radius, saturation=image.saturation_without_sky,

@@ -240,9 +240,16 @@ def one_each(values, n, name):
     if len(values) == 1:
         return list(values) * n
     if len(values) != n:
-        msg = f'--{name} must have 1 value or {n}, got {len(values)}'
+        one_or_n = '1 value' if n == 1 else f'1 value or {n}'
+        msg = f'--{name} must have {one_or_n}, got {len(values)}'
         raise ValueError(msg)
     return list(values)
+
+
+def no_places(path, table):
+    """Return a sentence on a table without places of stars."""
+    return (f'{path}: must have columns ra and dec, or x and y, got '
+            f'{table.colnames}')
 
 
 def check_inputs(paths):

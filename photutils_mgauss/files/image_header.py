@@ -107,8 +107,11 @@ class Cards:
     def gain_problem(self):
         """Why gains that a header has are not used, '' if they are."""
         gains = self._output_gains
-        if self.gain is not None or not gains:
+        given = self.get(*_GAIN)
+        if self.gain is not None or not (gains or given):
             return ''
+        if not gains:
+            return f'its keyword of the gain is {given!r}, no positive number'
         if self._contradicts:
             return ('its keywords ESO DET OUTn CONAD and GAIN are not the '
                     'inverse of each other')

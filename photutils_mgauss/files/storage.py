@@ -235,11 +235,11 @@ def _native(column):
 
 def _check_class(found, cls, name):
     if found != cls.__name__:
-        remedy = (f'{found}.read takes it' if found else
-                  'GriddedMixturePSF.from_file takes the PSFs of other '
-                  'programs')
-        msg = (f'{name}: file must hold a {cls.__name__}, got one with '
-               f'{found or "nothing of this package"}; {remedy}')
+        got, remedy = (
+            (f'a {found}', f'{found}.read takes it') if found else
+            ('a file of another program',
+             'GriddedMixturePSF.from_file takes the PSFs of other programs'))
+        msg = f'{name}: must hold a {cls.__name__}, got {got}; {remedy}'
         raise UnusableFileError(msg)
 
 

@@ -68,8 +68,9 @@ def read_table(path):
 def _read_text(path):
     try:
         return QTable.read(path)
-    except IORegistryError as error:
-        # Its own words are followed by all formats there are.
+    except (IORegistryError, ImportError) as error:
+        # Its own words are followed by all formats there are, or name a
+        # package for pages of HTML.
         msg = ('a file of none of the kinds that it recognises, nor a star '
                'list of DAOPHOT, DOLPHOT, hst1pass, SExtractor or '
                'StarFinder; images and PSFs are FITS or ASDF files, and '

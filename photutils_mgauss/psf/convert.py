@@ -387,7 +387,8 @@ def _check_choices(path, kind, *, ext, detector):
     """Raise for a kind of file that has no PSF, or no such choice."""
     if kind == 'image':
         msg = (f'{path}: must hold a PSF: one of this package, a PSFEx model, '
-               'a grid of ePSFs, or an image with the keyword OVERSAMP')
+               'a grid of ePSFs, or an image with the keyword OVERSAMP or '
+               'with oversampling (--oversampling)')
         raise UnusableFileError(msg)
     for name, value, kinds in (('ext', ext, _WITH_EXTENSIONS),
                                ('detector', detector, _WITH_DETECTORS)):

@@ -121,7 +121,7 @@ def test_lists_of_other_programs_are_read():
 
 
 @pytest.mark.parametrize(('table', 'options', 'words'), [
-    ({'a': X}, (), 'must have the columns ra and dec, or x and y'),
+    ({'a': X}, (), "must have columns ra and dec, or x and y, got ['a']"),
     ({'x': X + 500, 'y': Y}, (), 'all 5 are outside, by their x and y'),
     ({'x': [], 'y': []}, (), 'must have at least 1 star, got none'),
     ({'x': X, 'y': Y}, ('--crowded', '--fixed'), 'without --crowded'),
@@ -145,3 +145,22 @@ def test_positions_on_the_sky_need_a_wcs(capsys):
 def test_fixed_needs_a_list(capsys):
     assert main([*COMMAND, '--fixed']) == 1
     assert '--fixed must be given with --stars' in capsys.readouterr().err
+
+
+def test_a_psf_takes_its_stars_from_a_list_on_the_sky(rng, capsys):
+    stars = np.stack(np.meshgrid([12.0, 32, 52, 72], [15.0, 40, 65]))
+    x, y = stars.reshape(2, -1) + rng.uniform(-3, 3, (2, 12))
+    with fits.open('a.fits', mode='update') as hdus:
+        data = rng.normal(20, 2, SHAPE)
+        for place in zip(x, y, strict=True):
+            data += PSF.render(SHAPE, *place, flux=9000)
+        hdus['SCI'].data = data
+    ra, dec = tangent().pixel_to_world_values(x, y)
+    QTable({'ra': [*ra, 12.0] * u.deg, 'dec': [*dec, 3.0] * u.deg}).write(
+        'list.ecsv')
+    assert main(['psf', 'a.fits', '--stars', 'list.ecsv', '--output',
+                 'new.fits', '--n-components', '1', '--degree', '0']) == 0
+    said = capsys.readouterr().out
+    assert '12 of the 13 stars of list.ecsv are in the image' in said
+    found = GriddedMixturePSF.read('new.fits').mixture_at(50, 45)
+    assert_allclose(found.covariances[0], PSF.covariances[0], atol=0.05)

@@ -58,11 +58,15 @@ def test_info_says_what_keeps_an_image_from_being_measured(folder, capsys):
     assert main(['info', 'missing.fits']) == 1
 
 
-def test_info_says_that_a_text_is_none_of_the_files(folder, capsys):
-    (folder / 'notes.md').write_text('# Stars\n\nSome *words*.\n')
-    assert main(['info', 'notes.md']) == 1
+@pytest.mark.parametrize(('name', 'text'), [
+    ('notes.md', '# Stars\n\nSome *words*.\n'),
+    ('page.html', '<!DOCTYPE html><html><p>Stars</p></html>')])
+def test_info_says_that_a_text_is_none_of_the_files(folder, capsys, name,
+                                                    text):
+    (folder / name).write_text(text)
+    assert main(['info', name]) == 1
     assert capsys.readouterr().err.strip() == (
-        'mgauss: notes.md: must be a table that astropy can read, got a file '
+        f'mgauss: {name}: must be a table that astropy can read, got a file '
         'of none of the kinds that it recognises, nor a star list of '
         'DAOPHOT, DOLPHOT, hst1pass, SExtractor or StarFinder; images and '
         'PSFs are FITS or ASDF files, and other tables are read in Python '

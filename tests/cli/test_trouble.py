@@ -198,6 +198,13 @@ def no_work(monkeypatch):
     ('motions 1_cat.ecsv 1_cat.ecsv', '1_cat.ecsv: must be given only once'),
     ('motions 1.fits 2.fits --time noon', '--time must be a date'),
     ('motions 1.fits 2.fits --wcs a b c', '--wcs must have 1 value or 2'),
+    ('photometry 1.fits --psf psf.fits psf.fits', 'must have 1 value, got 2'),
+    ('photometry 1.fits --psf psf.fits --stars psf.fits --output n/',
+     "psf.fits: must have columns ra and dec, or x and y, got ['NAME'"),
+    ('psf 1.fits --stars psf.fits',
+     "psf.fits: must have columns ra and dec, or x and y, got ['NAME'"),
+    ('motions psf.fits 1_cat.ecsv',
+     "psf.fits: must have columns ra and dec, or x and y, got ['NAME'"),
     ('motions 1.fits 2.fits --output 1.fits', 'must be a folder'),
     ('motions 1.fits 2.fits --output 1.fits/a', '1.fits is a file'),
     ('photometry 1.fits ./1.fits --psf psf.fits', 'given only once'),
@@ -256,6 +263,7 @@ def test_wrong_usage_is_explained_by_the_command(capsys, words, said):
 
 @pytest.mark.parametrize(('word', 'said'), [
     ('fotometry', r'command: fotometry \(did you mean photometry\?\)'),
+    ('phot', r'command: phot \(did you mean photometry\?\)'),
     ('demmo', r'\(did you mean demo\?\)'),
     ('zzz', 'unknown command: zzz; there are psf, photometry, motions')])
 def test_a_wrong_command_gets_a_hint(capsys, word, said):

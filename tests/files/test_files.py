@@ -145,7 +145,7 @@ def test_any_fits_tool_can_read_the_tables(tmp_path):
 def test_a_file_of_another_class_is_refused(name, tmp_path):
     some_mixture(np.random.default_rng(1)).write(tmp_path / name)
     with pytest.raises(ValueError, match=r'must hold a GriddedMixturePSF, got '
-                       r'.* with GaussianMixture'):
+                       r'a GaussianMixture; GaussianMixture\.read takes it'):
         GriddedMixturePSF.read(tmp_path / name)
 
 
@@ -153,7 +153,7 @@ def test_files_of_others_are_refused(tmp_path):
     fits.PrimaryHDU(np.ones((2, 2))).writeto(tmp_path / 'a.fits')
     asdf.AsdfFile({'a': 3}).write_to(tmp_path / 'a.asdf')
     for name in ('a.fits', 'a.asdf'):
-        with pytest.raises(ValueError, match='nothing of this package'):
+        with pytest.raises(ValueError, match='got a file of another pro'):
             GriddedMixturePSF.read(tmp_path / name)
 
 
@@ -173,7 +173,7 @@ def test_one_of_several_objects_is_not_taken_unasked(tmp_path):
 def test_images_with_extensions_are_refused_in_words(tmp_path):
     fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(np.ones((2, 2)), name='SCI')
                   ]).writeto(tmp_path / 'image.fits')
-    with pytest.raises(ValueError, match=r'image\.fits: file must hold a .*'
+    with pytest.raises(ValueError, match=r'image\.fits: must hold a .*'
                        'from_file takes the PSFs of other programs'):
         GriddedMixturePSF.read(tmp_path / 'image.fits')
 

@@ -92,6 +92,14 @@ def test_without_gain_the_noise_is_an_error_that_tells_what_to_give(
     assert read_image(path, Reading(gain=1.0)).noise.gain == 1
 
 
+@pytest.mark.parametrize('gain', ['1.5 e/ADU', -2.0])
+def test_a_gain_that_is_no_positive_number_is_named(tmp_path, sky, gain):
+    path = tmp_path / 'plain.fits'
+    fits.PrimaryHDU(sky, header(GAIN=gain)).writeto(path)
+    with pytest.raises(ValueError, match=f'gain is {gain!r}, no positive'):
+        _ = read_image(path).noise
+
+
 def test_a_surface_brightness_takes_the_gain_given(tmp_path, sky):
     path = tmp_path / 'plain.fits'
     fits.PrimaryHDU(sky / 500, header(BUNIT='MJy/sr', GAIN=3.0)).writeto(path)
