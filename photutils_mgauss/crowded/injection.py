@@ -14,8 +14,10 @@ from photutils_mgauss.utils.star_columns import column_values
 from photutils_mgauss.utils.validation import (
     as_floats,
     as_integer,
+    as_range,
     as_real,
     as_rng,
+    shown,
 )
 from photutils_mgauss.utils.waiting import waiting
 
@@ -129,6 +131,10 @@ def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
     1.0
     """
     rng = as_rng(rng)
+    if not hasattr(photometry, 'psf_used'):
+        msg = ('photometry must be a CrowdedMixturePhotometry, got '
+               f'{shown(photometry)}')
+        raise TypeError(msg)
     pixels = read_pixels(data, error, mask).with_error()
     image, variance = pixels.part()
     flux = _true_fluxes(flux, pixels.unit)
@@ -261,7 +267,7 @@ def _true_fluxes(flux, unit):
     if not (values > 0).all():
         msg = f'flux must be positive, got {values.min()}'
         raise ValueError(msg)
-    return tuple(values) if isinstance(flux, tuple) else values
+    return as_range(values, 'flux') if isinstance(flux, tuple) else values
 
 
 def _with_units(table, names, unit):

@@ -243,13 +243,14 @@ def fit_field(pixels, options, solve, effective_gain=None):
     MixtureField
     """
     image = CrowdedImage.of(pixels, effective_gain)
-    passes, steady = [first_field(image, options.rules)], 0
+    first, said = _unsaid(first_field, image, options.rules)
+    passes, steady = [first], 0
     options = options.widened(passes[0])
     with progress(total=options.max_passes, desc='PSF',
                   shown=options.progress_bar) as bar:
         for number in range(options.max_passes):
-            field, solved = next_field(image, passes[-1], number, options,
-                                       solve)
+            (field, solved), said = _unsaid(
+                next_field, image, passes[-1], number, options, solve)
             change = difference(field, passes[-1])
             passes = [*passes[-2:], field]
             _advance(bar, field, change)
@@ -261,14 +262,28 @@ def fit_field(pixels, options, solve, effective_gain=None):
                            or (steady > 2 and turns_back(*passes))):
                 _tell_of_few(field, passes[-2], solved, number, options)
                 if options.has_few(field):
-                    field = _of_few(solved, passes[-2], field.radius, options)
+                    field, said = _unsaid(_of_few, solved, passes[-2],
+                                          field.radius, options)
                 break
         else:
             warnings.warn(
                 f'the PSF still changes by {change:.2%} from pass to pass '
                 f'after max_passes={options.max_passes}', AstropyUserWarning,
                 stacklevel=4)
+    for one in said:
+        warnings.warn(one.message, stacklevel=4)
     return _with_unit(_with_far_light(field, passes[-2], solved), pixels.unit)
+
+
+def _unsaid(fit, *args):
+    """
+    Return what a fit returns, and its warnings, which it does not give.
+
+    Those of all passes but the last are of fields that nobody gets.
+    """
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter('always', AstropyUserWarning)
+        return fit(*args), said
 
 
 def _with_far_light(field, before, solved):

@@ -153,10 +153,7 @@ def read_sample(data, stars, error, mask, radius, gain, contexts=()):
         for (_, table), part in zip(exposures, parts, strict=True)])
     stamps = Stamps.joined([part[0] for part in parts])
     if not len(stamps.data):
-        msg = (f'stars must hold at least 1 star whose pixels can be used, '
-               f'got none of {sum(part[2].x.size for part in parts)}: they '
-               f'are outside the image, masked, or too near the edge')
-        raise ValueError(msg)
+        raise ValueError(_no_star([part[2] for part in parts]))
     _check_light(stamps)
     most = max(part[4].shape[1] for part in parts)
     stars = [number[part[1]] for number, part in zip(
@@ -179,6 +176,19 @@ def read_sample(data, stars, error, mask, radius, gain, contexts=()):
         np.ones(len(parts)), values,
         Contexts.of_stars(contexts, values) if contexts else None,
         star, places(star, *where, exposures[0][0].shape))
+
+
+def _no_star(sources):
+    """Return why none of the sources can be used."""
+    n = sum(one.x.size for one in sources)
+    if not n:
+        return 'stars must hold at least 1 star, got a table without rows'
+    if not any(one.selected.any() for one in sources):
+        return ("the column 'selected' of stars must be true for at least 1 "
+                f'star, got none of {n}')
+    return ('stars must hold at least 1 star whose pixels can be used, got '
+            f'none of {n}: they are outside the image, masked, or too near '
+            'the edge')
 
 
 def _numbered(values):

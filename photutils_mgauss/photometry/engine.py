@@ -9,8 +9,10 @@ import itertools
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
+from os import PathLike
 
 import numpy as np
+from astropy.modeling import Model
 
 from photutils_mgauss import kernels
 from photutils_mgauss.psf.base import PSFModel
@@ -18,6 +20,7 @@ from photutils_mgauss.psf.mixture import GaussianMixture
 from photutils_mgauss.psf.rows import falls
 from photutils_mgauss.utils.image import FITTED_BY
 from photutils_mgauss.utils.parallel import Threads, map_parallel
+from photutils_mgauss.utils.validation import shown
 from photutils_mgauss.utils.waiting import progress
 
 CONVERGED = (kernels.CONVERGED, kernels.STALLED)
@@ -66,20 +69,38 @@ def _full_mask(data, mask):
     return np.empty((0, 0), bool) if finite.all() else ~finite
 
 
-def as_model(psf):
+def as_model(psf, name='psf_model'):
     """
-    Return a PSF as a model; fields are sampled on a grid.
+    Return a PSF as a model; fields are sampled on a grid, None stays None.
 
     Raises
     ------
     TypeError
-        If it is a mixture, which has neither a position nor a flux.
+        If it is no model, such as a mixture, which has neither a position
+        nor a flux.
     """
-    if isinstance(psf, GaussianMixture):
-        msg = ('psf_model must be a model with a position and a flux, got a '
-               'GaussianMixture: give MultiGaussianPSFModel(mixture)')
+    if hasattr(psf, 'to_grid'):
+        return psf.to_grid()
+    if not (psf is None or isinstance(psf, Model)):
+        msg = (f'{name} must be a model with a position and a flux, got '
+               f'{_what_it_is(psf)}')
         raise TypeError(msg)
-    return psf.to_grid() if hasattr(psf, 'to_grid') else psf
+    return psf
+
+
+def _what_it_is(psf):
+    """Return what was given instead of a model, and what makes one of it."""
+    kind = type(psf).__name__
+    if isinstance(psf, GaussianMixture):
+        return f'a {kind}: give MultiGaussianPSFModel(mixture)'
+    if isinstance(getattr(psf, 'mixture', None), GaussianMixture):
+        return f'a {kind}: give MultiGaussianPSFModel(fit.mixture)'
+    if hasattr(psf, 'grid_xypos'):
+        return (f'a {kind}: GriddedMixturePSF.from_gridded_psf makes one of '
+                'it')
+    if isinstance(psf, str | PathLike):
+        return f'{shown(psf)}: GriddedMixturePSF.from_file reads PSF files'
+    return shown(psf)
 
 
 def psf_arrays(model):

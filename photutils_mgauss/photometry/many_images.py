@@ -578,7 +578,7 @@ def _read_image(entry):
 
 def fixed_psf(psf):
     """Return a PSF as a model of fixed shape, or raise."""
-    psf = as_model(psf)
+    psf = as_model(psf, 'the PSF of images')
     if not is_fixed_shape(psf):
         msg = f'images must hold PSFs of fixed shape, got {psf!r:.80}'
         raise TypeError(msg)

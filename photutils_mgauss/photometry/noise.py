@@ -278,7 +278,7 @@ class _StarDerivatives:
 def _kernel_arrays(psf):
     if isinstance(psf, GaussianMixture):
         psf = MultiGaussianPSFModel(psf)
-    return psf_arrays(as_model(psf))
+    return psf_arrays(as_model(psf, 'psf'))
 
 
 def _bound(derivatives, flux, noise, free_sky):

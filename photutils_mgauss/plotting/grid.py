@@ -12,6 +12,7 @@ from photutils_mgauss.plotting.style import (
     round_length,
 )
 from photutils_mgauss.psf.shapes import adaptive_moments
+from photutils_mgauss.utils.validation import as_choice
 
 __all__ = [
     'plot_node_map',
@@ -79,8 +80,10 @@ def plot_node_map(psf, column='size_error', *, layout=None, ax=None):
     >>> ax.get_xlabel(), ax.get_ylabel()
     ('x [pix]', 'y [pix]')
     """
-    ax = current_axes(ax)
     psfs, places = _laid_out(psf, layout)
+    for one in psfs.values():
+        _check_column(one.report, column)
+    ax = current_axes(ax)
     reports = {name: one.report for name, one in psfs.items()}
     values = np.concatenate([np.where(report['bridged'], np.nan,
                                       report[column])
@@ -98,6 +101,11 @@ def plot_node_map(psf, column='size_error', *, layout=None, ax=None):
         ax.set_title(f'{label}: median {np.median(good):.2g}, '
                      f'scatter {mad_std(good):.2g}')
     return _focal_plane(ax, psfs, places)
+
+
+def _check_column(report, column):
+    as_choice(column, 'column', tuple(
+        name for name in report.colnames if report[name].dtype.kind in 'fi'))
 
 
 def plot_whiskers(psf, *, layout=None, scale=None, ax=None):
@@ -203,8 +211,9 @@ def plot_worst_node(psf, source, column='size_error', *, ax=None):
     >>> ax.get_title().partition(', $')[0]
     'node (0, 0)'
     """
-    ax = current_axes(ax)
     report = psf.report
+    _check_column(report, column)
+    ax = current_axes(ax)
     error = np.where(report['bridged'], 0, np.abs(report[column]))
     worst = int(np.nanargmax(error))
     distance = np.hypot(*(np.array(source.grid_xypos, float)

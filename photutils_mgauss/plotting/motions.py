@@ -8,6 +8,7 @@ from photutils_mgauss.plotting.style import (
     ORANGE,
     colour_bar,
     current_axes,
+    one_each,
     round_length,
 )
 
@@ -387,9 +388,10 @@ def plot_motions_by_magnitude(stars, magnitude, *, ax=None):
     >>> ax.get_xlabel(), ax.get_ylabel()
     ('magnitude [mag]', 'motion [pix / yr]')
     """
+    magnitude = one_each(magnitude, len(stars), 'magnitude')
     ax = current_axes(ax)
     for name, colour in (('pmra', ORANGE), ('pmdec', BLUE)):
-        ax.errorbar(np.asarray(magnitude), stars[name].value,
+        ax.errorbar(magnitude, stars[name].value,
                     stars[f'{name}_error'].value, fmt='.', color=colour,
                     alpha=0.5, elinewidth=0.5, markersize=3, label=name)
     ax.set(xlabel='magnitude [mag]', ylabel=f'motion [{stars["pmra"].unit}]')
@@ -442,16 +444,18 @@ def plot_motion_errors(stars, magnitude, *, bound=None, ax=None):
     >>> ax.get_xlabel(), ax.get_ylabel()
     ('magnitude [mag]', 'error [pix / yr]')
     """
+    magnitude = one_each(magnitude, len(stars), 'magnitude')
     ax = current_axes(ax)
     free = ~_is_reference(stars)
     for name, colour in (('pmra', ORANGE), ('pmdec', BLUE)):
-        ax.plot(np.asarray(magnitude)[free],
+        ax.plot(magnitude[free],
                 stars[f'{name}_error'][free].value, '.', color=colour,
                 markersize=3, label=name)
     if bound is not None:
-        order = np.argsort(np.asarray(magnitude)[free])
-        ax.plot(np.asarray(magnitude)[free][order],
-                np.asarray(bound)[free][order], color='black', label='bound')
+        bound = one_each(bound, len(stars), 'bound')
+        order = np.argsort(magnitude[free])
+        ax.plot(magnitude[free][order], bound[free][order], color='black',
+                label='bound')
     ax.set(yscale='log', xlabel='magnitude [mag]',
            ylabel=f'error [{stars["pmra"].unit}]')
     ax.legend()

@@ -5,12 +5,24 @@ The colours are those of Okabe and Ito, which the colour-blind can tell apart.
 """
 import numpy as np
 
+from photutils_mgauss.utils.validation import real_array
+
 __all__ = ['BLACK', 'BLUE', 'CYCLE', 'GREY', 'ORANGE', 'VERMILION',
-           'colour_bar', 'current_axes', 'round_length']
+           'colour_bar', 'current_axes', 'one_each', 'round_length']
 
 BLACK, BLUE, ORANGE, VERMILION = '#000000', '#0072B2', '#E69F00', '#D55E00'
 GREY = '#9a9a9a'
 CYCLE = (BLUE, ORANGE, '#009E73', '#CC79A7', VERMILION, '#56B4E9', '#F0E442')
+
+
+def one_each(values, n, name):
+    """Return numbers (n,), one for each of n stars, or raise."""
+    values = real_array(values, name)
+    if values.shape != (n,):
+        msg = (f'{name} must have a number for each of the {n} stars, got '
+               f'the shape {values.shape}')
+        raise ValueError(msg)
+    return values
 
 
 def current_axes(ax):

@@ -202,7 +202,11 @@ def _detector(model, truth, shape):
 
 def _profiles(psf, name, oversampling):
     """Return what makes a mixture or image of a position, its sampling."""
-    profile = getattr(psf, 'mixture_at', psf)
+    if isinstance(psf, GaussianMixture):
+        def profile(*_):
+            return psf
+    else:
+        profile = getattr(psf, 'mixture_at', psf)
     if not callable(profile):
         msg = (f'{name} must have a method mixture_at or be callable, got '
                f'{psf!r:.80}')

@@ -38,15 +38,13 @@ def julian_years(time, name='time', *, within=OBSERVED):
     years are an error, as are quantities that are no years: a length of
     time, such as 59000 days, is no date.
     """
-    time = _read_dates(time)
-    if isinstance(time, Time):
-        with warnings.catch_warnings():
-            # UTC after the last announced leap second is uncertain by a
-            # second, which no proper motion can notice.
-            warnings.simplefilter('ignore', erfa.ErfaWarning)
-            years = np.ma.filled(time.tdb.jyear, np.nan)
-    else:
-        years = _plain_years(time, name)
+    with warnings.catch_warnings():
+        # UTC after the last announced leap second is uncertain by a second,
+        # which no proper motion can notice.
+        warnings.simplefilter('ignore', erfa.ErfaWarning)
+        time = _read_dates(time)
+        years = (np.ma.filled(time.tdb.jyear, np.nan)
+                 if isinstance(time, Time) else _plain_years(time, name))
     years = np.asarray(years, dtype=float)
     # Infinite years are unknown ones, too.
     years = np.where(np.isfinite(years), years, np.nan)

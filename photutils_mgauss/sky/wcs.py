@@ -7,6 +7,7 @@ of shape (3, n), whatever frame the WCS has.
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import SkyCoord
+from astropy.io.fits import Header
 
 from photutils_mgauss.sky.gnomonic import STEP, Gnomonic
 from photutils_mgauss.sky.tangent_plane import local_axes, unit_vectors
@@ -16,8 +17,10 @@ from photutils_mgauss.utils.validation import as_integer, as_real
 def check_celestial(wcs, name='wcs'):
     """Raise unless ``wcs`` maps two pixel axes to a celestial frame."""
     if not hasattr(wcs, 'pixel_to_world_values'):
+        hint = ('; astropy.wcs.WCS(header) makes one of it'
+                if isinstance(wcs, Header) else '')
         msg = (f'{name} must be an APE 14 WCS (gwcs or astropy.wcs), got '
-               f'{type(wcs).__name__}')
+               f'{type(wcs).__name__}{hint}')
         raise TypeError(msg)
     physical = tuple(wcs.world_axis_physical_types)
     if wcs.pixel_n_dim != 2 or len(physical) != 2:

@@ -744,6 +744,13 @@ def test_bright_artificial_stars_come_back(crowd):
     assert_allclose(again.stars['x_fit'], stars['x_fit'])
 
 
+def test_what_cannot_be_injected_is_named(crowd):
+    with pytest.raises(TypeError, match='photometry must be a Crowded'):
+        inject_and_recover(photometry().psf_model, crowd[0], (2e3, 6e4))
+    with pytest.raises(ValueError, match=r'flux must be \(lower, higher\)'):
+        inject_and_recover(photometry(), crowd[0], (6e4, 2e3))
+
+
 def test_the_solution_of_conjugate_gradients_solves_the_equations():
     rng = np.random.default_rng(4)
     n = 5

@@ -68,6 +68,21 @@ def field_of_corner():
     return fit_crowded_psf(**corner(), **SHORT)
 
 
+def test_a_warning_of_the_last_pass_is_given_once(rng):
+    from scipy.ndimage import gaussian_filter
+    mixture = GaussianMixture([1], [(0, 0)], [[[1.2, 0], [0, 1.0]]])
+    data = 100 + gaussian_filter(rng.normal(0, 10, (140, 140)), 0.8)
+    for x, y in rng.uniform(8, 132, (60, 2)):
+        data += mixture.render(data.shape, x, y,
+                               flux=10 ** rng.uniform(3.3, 4.5))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('always')
+        fit_crowded_psf(data, error=np.full(data.shape, 3.3), n_components=1,
+                        degree=0, radius=8)
+    said = [str(one.message) for one in caught]
+    assert len([one for one in said if 'is correlated' in one]) == 1, said
+
+
 @cache
 def measured():
     """Return the stars, with the true PSF and with the image's own."""

@@ -6,7 +6,11 @@ import pytest
 from astropy.table import Table
 from astropy.utils.exceptions import AstropyUserWarning
 
-from photutils_mgauss import GaussianMixture, select_psf_stars
+from photutils_mgauss import (
+    GaussianMixture,
+    fit_mixture_field,
+    select_psf_stars,
+)
 
 PSF = GaussianMixture([1], [[0, 0]], [[[2, 0], [0, 2]]])
 SHAPE = (160, 200)
@@ -174,3 +178,12 @@ def test_an_image_of_nothing_is_said_without_a_threshold(value, words):
           if np.isnan(value) else nullcontext()), \
             pytest.raises(ValueError, match=words):
         select_psf_stars(np.full(SHAPE, value))
+
+
+def test_a_table_without_a_star_for_the_psf_is_named():
+    data = np.zeros((40, 40))
+    stars = Table({'x': [20.0], 'y': [20.0], 'selected': [False]})
+    with pytest.raises(ValueError, match="column 'selected' of stars must be"):
+        fit_mixture_field(data, stars, error=1.0)
+    with pytest.raises(ValueError, match='got a table without rows'):
+        fit_mixture_field(data, stars[:0], error=1.0)

@@ -3,6 +3,7 @@ import astropy.units as u
 import numpy as np
 import pytest
 from astropy import coordinates as coord
+from astropy.io import fits
 from astropy.table import MaskedColumn, QTable, Table
 from astropy.time import Time
 from astropy.wcs import WCS
@@ -114,6 +115,11 @@ def test_times_beyond_the_leap_seconds_are_quiet(year):
     assert_allclose(Epoch(table(), time=utc).mean_year, year, atol=1e-5)
 
 
+def test_dates_beyond_the_leap_seconds_are_quiet():
+    assert_allclose(Epoch(table(), time='2050-01-01').mean_year, 2050,
+                    atol=1e-5)
+
+
 def test_times_may_come_with_the_rows():
     years = Epoch(table(time=[2020.0, 2020.5])).years
     assert_allclose(years, [2020.0, 2020.5])
@@ -121,6 +127,8 @@ def test_times_may_come_with_the_rows():
 
 @pytest.mark.parametrize(('make', 'error', 'words'), [
     (lambda: Epoch([1, 2], time=2020.0), TypeError, 'table must be'),
+    (lambda: Epoch(table(), fits.Header(), 2020.0), TypeError,
+     r'got Header; astropy\.wcs\.WCS\(header\) makes'),
     (lambda: Epoch(Table({'x': [1.0]}), time=2020.0), ValueError,
      "column 'y_fit' or 'y'"),
     (lambda: Epoch(table()), ValueError, 'time must be given'),

@@ -5,6 +5,7 @@ import time
 import warnings
 from functools import partial
 from itertools import product
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
@@ -267,3 +268,16 @@ def test_a_mixture_is_no_model_and_the_sentence_says_what_is():
                  lambda: CrowdedMixturePhotometry(MIXTURE)):
         with pytest.raises(TypeError, match=r'MultiGaussianPSFModel\(mix'):
             call()
+
+
+@pytest.mark.parametrize(('psf', 'words'), [
+    (MIXTURE, r'a GaussianMixture: give MultiGaussianPSFModel\(mixture\)'),
+    (SimpleNamespace(mixture=MIXTURE), r'MultiGaussianPSFModel\(fit\.mix'),
+    (SimpleNamespace(grid_xypos=[]), 'from_gridded_psf makes one of it'),
+    ('psf.fits', r"'psf\.fits': GriddedMixturePSF\.from_file reads"),
+    (3, 'a flux, got 3$')])
+@pytest.mark.parametrize('make', [lambda psf: MixturePSFPhotometry(psf, 5),
+                                  CrowdedMixturePhotometry])
+def test_what_is_no_model_is_named_with_what_makes_one(make, psf, words):
+    with pytest.raises(TypeError, match=words):
+        make(psf)

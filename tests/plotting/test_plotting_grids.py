@@ -29,6 +29,16 @@ def test_maps_hold_every_node_and_name_median_and_scatter(ax):
     assert f'median {median:.2g}, scatter' in ax.get_title()
 
 
+def test_a_column_that_is_no_number_of_the_report_is_named():
+    psf = make_grid()
+    for draw in (plotting.plot_node_map,
+                 lambda *a: plotting.plot_worst_node(a[0], None, a[1])):
+        for column in ('sizes', 'bridged'):
+            with pytest.raises(ValueError, match="column must be one of '.*'"
+                               f'scale.* got {column!r}'):
+                draw(psf, column)
+
+
 def test_detectors_are_laid_out_like_the_focal_plane(ax):
     psfs = {'A': make_grid(), 'B': make_grid(seed=4)}
     plotting.plot_node_map(psfs, 'scale',

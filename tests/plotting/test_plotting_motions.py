@@ -73,6 +73,20 @@ def test_errors_against_magnitude_and_epochs_are_those_of_the_table(
                                        for errors in measured])
 
 
+def test_magnitudes_of_other_stars_are_refused(axes, solutions):
+    from photutils_mgauss.plotting import (
+        plot_motion_errors,
+        plot_motions_by_magnitude,
+    )
+    stars = solutions[1].stars
+    for draw in (plot_motion_errors, plot_motions_by_magnitude):
+        with pytest.raises(ValueError, match='magnitude must have a number '
+                           'for each of the 120 stars, got the shape'):
+            draw(stars, np.arange(119.0), ax=axes)
+        with pytest.raises(TypeError, match='magnitude must be an array'):
+            draw(stars, 'mag', ax=axes)
+
+
 def test_cutouts_show_each_image_three_times(axes, rng):
     from photutils_mgauss.plotting import plot_cutouts
     stamps = rng.normal(0, 2, (3, 2, 5, 5))

@@ -54,6 +54,13 @@ def test_images_and_mixtures_agree():
     assert_allclose(report.table['r2'], closed.table['r2'], rtol=1e-3)
 
 
+def test_one_mixture_is_a_truth_that_is_the_same_everywhere():
+    report = assess_psf(varying, varying(5, 5), (2, 2), shape=(50, 50))
+    same = assess_psf(varying, lambda x, y: varying(5, 5), (2, 2),
+                      shape=(50, 50))
+    assert_allclose(report.table['size_error'], same.table['size_error'])
+
+
 def test_errors_name_the_argument():
     with pytest.raises(TypeError, match='truth must have a method'):
         assess_psf(varying, 3, shape=(9, 9))
