@@ -35,6 +35,9 @@ from photutils_mgauss.utils.waiting import waiting
 
 __all__ = ['MixturePosterior', 'sample_mixture']
 
+# The columns of a summary, and how numbers are shown in them.
+_SHOWN = {'mean': '.4g', 'std': '.2g', 'q16': '.4g', 'q50': '.4g',
+          'q84': '.4g', 'r_hat': '.3f', 'ess': '.0f'}
 # What of `fit_mixture` has a meaning for the posterior.
 _FIT_KEYWORDS = ('oversampling', 'origin', 'error', 'mask', 'radius',
                  'enclosed_flux', 'normalize', 'start')
@@ -195,8 +198,11 @@ class MixturePosterior:
             quantiles = np.quantile(draws, [0.16, 0.5, 0.84])
             rows.append((name, draws.mean(), draws.std(), *quantiles,
                          split_r_hat(draws), effective_size(draws)))
-        return QTable(rows=rows, names=('parameter', 'mean', 'std', 'q16',
-                                        'q50', 'q84', 'r_hat', 'ess'))
+        table = QTable(rows=rows, names=('parameter', *_SHOWN))
+        # So that the whole table is seen in a terminal of 80 columns.
+        for name, digits in _SHOWN.items():
+            table[name].info.format = digits
+        return table
 
     def plot(self, names=None, *, axes=None):
         """

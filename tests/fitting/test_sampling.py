@@ -35,6 +35,15 @@ def test_the_chains_agree_and_have_many_independent_draws(posterior):
     assert posterior.means.shape == (2, 300, 2, 2)
 
 
+def test_the_summary_is_shown_whole_on_a_terminal(posterior):
+    table = posterior.summary()
+    lines = table.pformat(max_width=80, max_lines=-1)
+    assert not any('...' in line for line in lines)
+    assert lines[0].split() == table.colnames
+    assert float(lines[2].split()[1]) == pytest.approx(table['mean'][0],
+                                                       rel=1e-3)
+
+
 def test_the_posterior_is_where_and_as_wide_as_least_squares_says(posterior):
     fit = posterior.fit
     errors = np.sqrt(np.diag(fit.covariance)).reshape(2, 6)
