@@ -61,6 +61,10 @@ class InjectionResult:
     stars: QTable
     curves: QTable
 
+    def __repr__(self):
+        return (f'<InjectionResult: {np.sum(self.stars["recovered"])} of '
+                f'{len(self.stars)} artificial stars were recovered>')
+
 
 def inject_and_recover(photometry, data, flux, *, mask=None, error=None,
                        separation=20, radius=0.7, flux_ratio=2.5,

@@ -49,6 +49,5 @@ def whole_file(path, *, overwrite=True):
 
 def _check_free(path, overwrite):
     if path.exists() and not overwrite:
-        msg = (f'{path}: must be a free name, but such a file exists; '
-               'set overwrite to replace it')
+        msg = f'{path} exists; give overwrite=True to replace it'
         raise FileExistsError(msg)

@@ -160,6 +160,13 @@ class CramerRao:
     covariance: np.ndarray
     unit: object = None
 
+    def __repr__(self):
+        n = len(self.covariance)
+        flux, x, y = (np.median(one) for one in (self.flux_err, self.x_err,
+                                                 self.y_err))
+        return (f'<CramerRao of {n} star{"s" * (n != 1)}, median errors: '
+                f'flux {flux:.3g}, x {x:.2g} pix, y {y:.2g} pix>')
+
     @property
     def flux_err(self):
         """The errors of the fluxes, (n,)."""

@@ -99,7 +99,8 @@ class Scene:
 
     def __repr__(self):
         ny, nx = self.image.shape
-        return (f'<Scene: {ny} x {nx} pixels, {len(self.truth)} sources, '
+        return (f'<Scene: {ny} x {nx} pixels, {len(self.truth)} '
+                f'source{"s" * (len(self.truth) != 1)}, '
                 f'{self.exposure!r}>')
 
     @property

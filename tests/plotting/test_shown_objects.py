@@ -2,6 +2,7 @@
 import inspect
 from itertools import pairwise
 
+import astropy.units as u
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from numpy.testing import assert_allclose
 from photutils_mgauss import (
     GaussianMixture,
     GriddedMixturePSF,
+    InjectionResult,
     MixturePosterior,
+    cramer_rao,
     fit_mixture,
     fit_mixture_field,
     pixel_phase_error,
@@ -155,6 +158,18 @@ def test_a_corner_plot_is_legible_in_a_column(n, pyplot):
                        for tick in numbers_of(ax.yaxis))
     heights = [ax.yaxis.label.get_window_extent() for ax in axes[1:, 0]]
     assert all(low.y1 < high.y0 for high, low in pairwise(heights))
+
+
+def test_results_show_what_matters_in_one_line():
+    one = GaussianMixture([1], [[0, 0]], [[[1, 0], [0, 4]]])
+    assert repr(cramer_rao(one, [1e4], fit_shape=31)) == (
+        '<CramerRao of 1 star, median errors: flux 100, x 0.01 pix, '
+        'y 0.02 pix>')
+    assert repr(cramer_rao(one, [1e4] * 3 * u.adu)).startswith(
+        '<CramerRao of 3 stars, median errors: flux 1')
+    stars = QTable({'recovered': [True, False, True]})
+    assert repr(InjectionResult(stars, QTable())) == (
+        '<InjectionResult: 2 of 3 artificial stars were recovered>')
 
 
 def test_without_matplotlib_a_notebook_shows_the_text(monkeypatch):
