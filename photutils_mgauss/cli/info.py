@@ -93,6 +93,8 @@ def _of_record(record):
 
 def _of_wcs_alone(path):
     """Return what a WCS without an image is, None for all other files."""
+    import numpy as np
+
     from photutils_mgauss.files.image_layers import wcs_alone
     wcs = wcs_alone(path)
     if wcs is None:
@@ -102,8 +104,9 @@ def _of_wcs_alone(path):
     size = 'of unknown size' if nx is None else f'{nx} x {ny} pixels'
     x, y = (0, 0) if nx is None else ((nx - 1) / 2, (ny - 1) / 2)
     place = wcs.pixel_to_world(x, y).icrs
-    where = (f'  {kind} of an image {size}; pixel ({x:g}, {y:g}) is at ra '
-             f'{place.ra.deg:.6f}, dec {place.dec.deg:.6f} deg')
+    at = (f'at ra {place.ra.deg:.6f}, dec {place.dec.deg:.6f} deg'
+          if np.isfinite(place.ra.deg) else 'outside of its bounding box')
+    where = f'  {kind} of an image {size}; pixel ({x:g}, {y:g}) is {at}'
     return [f'{path}: a WCS without an image', where,
             '  psf, photometry and motions take it with --wcs']
 

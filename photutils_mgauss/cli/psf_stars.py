@@ -68,7 +68,7 @@ def no_stars(image, stars):
 
 def check_nodes(path, grid, stars):
     """
-    Warn if a PSF is wild where no star tells what it is.
+    Warn if the width of a PSF far from all stars is not to be believed.
 
     Parameters
     ----------
@@ -91,5 +91,5 @@ def check_nodes(path, grid, stars):
         warnings.warn(
             f'{path}: in {wild.sum()} of {wild.size} nodes the PSF is '
             f'{np.nanmin(ratio):.2g} to {np.nanmax(ratio):.2g} times as wide '
-            'as at the typical star: no stars tell what it is there; give a '
+            'as at the typical star: there are no stars near them; give a '
             'lower --degree, such as 1', UserWarning, stacklevel=2)

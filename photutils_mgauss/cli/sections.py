@@ -320,8 +320,9 @@ def alignment_section(path, table, record):
     return Section(f'Alignment: {path}', rows=rows, record=record,
                    verdict=_alignment_verdict(table, names),
                    text='The shift of the frame of each exposure in the '
-                        'middle of the field, and the residuals of its '
-                        'references.')
+                        'middle of the field, and the residuals of the '
+                        'objects that align it: the references, or all '
+                        'stars without any.')
 
 
 def _names_of_epochs(record):
@@ -341,8 +342,8 @@ def _alignment_verdict(table, names):
     worst = int(np.argmax(share))
     name = names.get(worst, f'epoch {worst}')
     return Verdict(bool(used.min() >= 5 and share[worst] < 0.25),
-                   f'{int(used.min())} references or more in every epoch, at '
-                   f'most {share[worst]:.0%} of them rejected ({name})')
+                   f'{int(used.min())} objects or more align each epoch; at '
+                   f'most {share[worst]:.0%} of them were rejected ({name})')
 
 
 def _number(value):

@@ -1,4 +1,4 @@
-"""Whether a PSF is believable where no star tells what it is."""
+"""Whether a PSF is believable far from all stars."""
 import numpy as np
 
 from photutils_mgauss.psf.shapes import adaptive_moments

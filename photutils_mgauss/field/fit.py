@@ -124,9 +124,9 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
         The degree of the polynomials, 0 for a PSF that is the same
         everywhere; by default 4, or 'auto' with 8 to 59 stars, or 1 with
         ``start``. It is lowered, with a warning, if there are too few
-        stars; the default also if the PSF were else three times as narrow
-        or wide as at any star where no star tells what it is, and a lower
-        degree describes the stars as well. 'auto' chooses a degree from 0
+        stars; the default also if the PSF far from all stars would be three
+        times as narrow or as wide as at any star, and a lower degree
+        describes the stars as well. 'auto' chooses a degree from 0
         to 5 in the same way as the number of Gaussians; with fewer than 60
         stars the field has the terms of one degree more, and of all up to
         4, with a prior about zero, so that errors include what the stars
@@ -328,9 +328,9 @@ def _tamed(field, refit):
     better = (not is_wild(*left)
               and lower.accuracy <= max(field.accuracy, POOR))
     warnings.warn(
-        f'where no star tells what it is, the PSF of degree {field.degree} is '
-        f'{widths[0]:.2g} times as narrow to {widths[1]:.2g} times as wide '
-        'as at any star; '
+        f'far from all stars the PSF of degree {field.degree} is between '
+        f'{widths[0]:.2g} times the smallest and {widths[1]:.2g} times the '
+        'largest width that it has at a star; '
         + (f'degree {lower.degree} is taken, which describes the stars as well'
            if better else 'give a lower degree, such as 1, to measure there'),
         AstropyUserWarning, stacklevel=4)

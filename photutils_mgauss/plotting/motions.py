@@ -6,10 +6,10 @@ from photutils_mgauss.plotting.style import (
     BLUE,
     GREY,
     ORANGE,
+    arrow_key,
     colour_bar,
     current_axes,
     one_each,
-    round_length,
 )
 
 __all__ = [
@@ -91,10 +91,14 @@ def plot_residual_vectors(solution, epoch, *, scale=None, title=None,
     # The frame holds the tips, too.
     ax.update_datalim(np.column_stack([x + u / unit, y + v / unit])[good])
     ax.autoscale_view()
-    ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal')
-    ax.set_title(f'epoch {epoch}' if title is None else title, loc='left')
-    ax.invert_xaxis()
-    _draw_key(ax, arrows, scale, rows['dra'].unit)
+    if 'x' in rows.colnames:  # a plane of its own, not the sky
+        unit = rows['x'].unit
+        ax.set(xlabel=f'x [{unit}]', ylabel=f'y [{unit}]', aspect='equal')
+    else:
+        ax.set(xlabel='east [arcsec]', ylabel='north [arcsec]', aspect='equal')
+        ax.invert_xaxis()
+    arrow_key(ax, arrows, scale, rows['dra'].unit,
+              f'epoch {epoch}' if title is None else title)
     return ax
 
 
@@ -159,16 +163,8 @@ def plot_residual_map(residuals, chip='', *, n_cells=6, scale=None, ax=None):
     ax.update_datalim(np.concatenate([(places - size / 2).T,
                                       (places + size / 2).T]))
     ax.autoscale_view()
-    ax.set_title(f'chip {chip}' if chip else '', loc='left')
-    _draw_key(ax, arrows, scale, 'pix')
+    arrow_key(ax, arrows, scale, 'pix', f'chip {chip}' if chip else '')
     return ax
-
-
-def _draw_key(ax, arrows, scale, unit):
-    """Draw an arrow of a round length above the Axes."""
-    key = round_length(scale)
-    ax.quiverkey(arrows, 0.85, 1.04, key, f'{key:g} {unit}', labelpos='W',
-                 color=BLUE)
 
 
 def _cells(residuals, chip, n_cells):
@@ -273,11 +269,16 @@ def plot_proper_motions(stars, *, membership=None, ax=None):
         some = stars[which]
         ax.errorbar(some['pmra'].value, some['pmdec'].value,
                     some['pmdec_error'].value, some['pmra_error'].value,
-                    fmt='.', elinewidth=0.5, label=label, **style)
+                    fmt='.', elinewidth=0.5, **style,
+                    label=label if len(some) else None)
     unit = stars['pmra'].unit
-    ax.set(xlabel=rf'$\mu_{{\alpha*}}$ [{unit}]',
-           ylabel=rf'$\mu_\delta$ [{unit}]', aspect='equal')
-    ax.invert_xaxis()
+    if 'ra' in stars.colnames:
+        ax.set(xlabel=rf'$\mu_{{\alpha*}}$ [{unit}]',
+               ylabel=rf'$\mu_\delta$ [{unit}]', aspect='equal')
+        ax.invert_xaxis()
+    else:
+        ax.set(xlabel=f'motion along x [{unit}]',
+               ylabel=f'motion along y [{unit}]', aspect='equal')
     ax.legend()
     return ax
 

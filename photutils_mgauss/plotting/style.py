@@ -8,7 +8,8 @@ import numpy as np
 from photutils_mgauss.utils.validation import real_array
 
 __all__ = ['BLACK', 'BLUE', 'CYCLE', 'GREY', 'ORANGE', 'VERMILION',
-           'colour_bar', 'current_axes', 'one_each', 'round_length']
+           'arrow_key', 'colour_bar', 'current_axes', 'one_each',
+           'round_length']
 
 BLACK, BLUE, ORANGE, VERMILION = '#000000', '#0072B2', '#E69F00', '#D55E00'
 GREY = '#9a9a9a'
@@ -49,3 +50,12 @@ def round_length(largest):
     decade = 10.0 ** np.floor(np.log10(max(largest, 1e-12)))
     return max(step * decade for step in (1, 2, 5)
                if step == 1 or step * decade <= largest)
+
+
+def arrow_key(ax, arrows, scale, unit, title=''):
+    """Draw an arrow of a round length above Axes, and a title above it."""
+    key = round_length(scale)
+    ax.quiverkey(arrows, 0.85, 1.04, key, f'{key:g} {unit}', labelpos='W',
+                 color=BLUE)
+    # Layouts keep room for titles, blank ones too, but not for keys.
+    ax.set_title(title or ' ', loc='left', pad=20)

@@ -174,6 +174,12 @@ def test_info_says_what_a_wcs_alone_is(folder, capsys):
     for name, kind in (('wcs.asdf', 'a gwcs'), ('wcs.fits', 'a FITS WCS')):
         assert (f'{name}: a WCS without an image\n  {kind} of an image of '
                 'unknown size; pixel (0, 0) is at ra 8') in said
+    bounded = gwcs.WCS(frames)
+    bounded.bounding_box = ((5, 95), (5, 95))
+    asdf.AsdfFile({'wcs': bounded}).write_to('part.asdf')
+    assert main(['info', 'part.asdf']) == 0
+    assert ('pixel (0, 0) is outside of its bounding box'
+            in capsys.readouterr().out)
     assert main(['info', 'words.asdf']) == 1
     assert "2 dimensions called 'data'" in capsys.readouterr().err
 

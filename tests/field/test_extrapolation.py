@@ -74,7 +74,7 @@ def test_stars_in_a_corner_tell_nothing_of_the_others(rng):
              'normalise': 'stamps', 'reject': False}
     stars = QTable({'x': x, 'y': y})
     data += rng.normal(0, error)
-    with pytest.warns(UserWarning, match='where no star tells what it is'):
+    with pytest.warns(UserWarning, match='far from all stars the PSF of'):
         fit_mixture_field(data, stars, **given)
     # Who asks for a degree has it.
     with warnings.catch_warnings():

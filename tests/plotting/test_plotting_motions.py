@@ -5,10 +5,12 @@ import pytest
 from astropy.table import QTable
 from numpy.testing import assert_allclose
 
-from helpers.motion_scenes import TIMES, make_truth, observe
+from helpers.motion_scenes import TIMES, make_truth, observe, plane_epochs
 from photutils_mgauss import ProperMotionFitter
 
 pytest.importorskip('matplotlib')
+from matplotlib.quiver import QuiverKey
+from matplotlib.text import Text
 
 
 @pytest.fixture
@@ -36,6 +38,44 @@ def test_every_detection_of_an_epoch_has_an_arrow(axes, solutions):
                     np.sort(rows['dra'].value))
     # Around right ascension 0 the field is not torn apart.
     assert np.ptp(arrows[0].get_offsets()[:, 0]) < 700
+
+
+@pytest.fixture(scope='module')
+def plane_solution():
+    epochs, _ = plane_epochs(np.random.default_rng(4))
+    return ProperMotionFitter().fit(epochs)
+
+
+def test_pixels_are_not_called_east_and_north(axes, plane_solution):
+    plane_solution.plot_residuals(1, ax=axes)
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ('x [pix]', 'y [pix]')
+    assert not axes.xaxis_inverted()
+    axes.clear()
+    plane_solution.plot(ax=axes)
+    assert axes.get_xlabel() == 'motion along x [pix / yr]'
+    assert not axes.xaxis_inverted()
+    assert [one.get_text() for one in axes.get_legend().get_texts()] == [
+        'stars']
+
+
+@pytest.mark.parametrize('title', ['night_of_a_very_long_name_indeed.fits',
+                                   ''])
+def test_the_key_is_on_the_figure_and_not_on_the_title(plane_solution, title):
+    from matplotlib.figure import Figure
+
+    from photutils_mgauss.plotting import plot_residual_vectors
+    figure = Figure(figsize=(5.2, 4.2), layout='constrained')
+    axes = figure.add_subplot()
+    plot_residual_vectors(plane_solution, 1, ax=axes, title=title)
+    figure.draw_without_rendering()
+    [key] = axes.findobj(QuiverKey)
+    box = key.text.get_window_extent()
+    assert figure.bbox.contains(box.x0, box.y0)
+    assert figure.bbox.contains(box.x1, box.y1)
+    name = axes.get_title(loc='left')
+    if name.strip():
+        [shown] = [one for one in axes.findobj(Text) if one.get_text() == name]
+        assert not shown.get_window_extent().overlaps(box)
 
 
 def test_the_diagram_shows_stars_and_references(axes, solutions):
