@@ -272,7 +272,8 @@ def _summary(options, stars):
              f'{len(stars)} stars, {n} with proper motions']
     gain = {} if options.frames is None else _gain(options, stars)
     if gain:
-        lines.append(f'catalogues gave {gain["motions"]}')
+        lines.append(f'{gain["motions"]} stars have proper motions from the '
+                     'catalogues of --frames')
     return lines
 
 

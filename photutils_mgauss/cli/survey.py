@@ -85,6 +85,10 @@ def run(options):
         return
     from photutils_mgauss.cli.survey_plan import read_survey
     path = Path(options.file)
+    if path.is_dir():
+        msg = (f'{path}: must be a SURVEY.toml, but is a folder; mgauss '
+               f'survey --init {path} writes one for the images in it')
+        raise ValueError(msg)
     tools.check_inputs([path])
     from photutils_mgauss.cli.survey_folder import check_output
     survey = read_survey(path)

@@ -269,3 +269,10 @@ def test_only_overlaps_of_one_group_connect():
     assert pairs.tolist() == [[0, 1]]
     assert 0.5 < share[0] < 0.95
     assert connected(pairs, 4) == [[0, 1], [2], [3]]
+
+
+def test_a_folder_in_place_of_a_survey_gets_a_hint(folder, capsys):
+    assert main(['survey', str(folder / 'raw')]) == 1
+    said = capsys.readouterr().err
+    assert re.search(r'raw: must be a SURVEY.toml, but is a folder; mgauss '
+                     r'survey --init .*raw writes one', said)
