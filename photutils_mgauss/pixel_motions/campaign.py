@@ -16,6 +16,8 @@ ESTIMATED = ('The images {where} came without errors: one number for each '
              'scaled by their residuals.')
 ONE_TIME = ('All images were taken at one time: positions and fluxes are '
             'fitted, motions are not.')
+FEW_TIMES = ('Motions with a {what} take images at {wanted} times or more, '
+             'got {got}: positions and fluxes are fitted, motions are not.')
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +93,24 @@ class Campaign:
             notes.append(ESTIMATED.format(where=where))
         if np.ptp(self.years) == 0:
             notes.append(ONE_TIME)
+        elif not self.has_times_enough:
+            what = ' and '.join(['parallax'] * self.parallax
+                                + ['acceleration'] * self.acceleration)
+            notes.append(FEW_TIMES.format(
+                what=what, wanted=self.n_times,
+                got=len(np.unique(np.round(self.years, 6)))))
         return tuple(notes)
+
+    @property
+    def n_times(self):
+        """The number of times that all parameters of a star take."""
+        return 2 + self.parallax + self.acceleration
+
+    @property
+    def has_times_enough(self):
+        """Whether a star in all images would have all parameters."""
+        every = np.ones((1, len(self.years)), bool)
+        return bool(_periods(self.years, every)[0] >= self.n_times)
 
     def factors(self, places):
         """
@@ -132,8 +151,7 @@ class Campaign:
         one more each. The second array (n,) says where all are fitted.
         """
         periods = _periods(dt, seen)
-        wanted = 2 + self.parallax + self.acceleration
-        enough = periods >= wanted
+        enough = periods >= self.n_times
         free = np.zeros((len(seen), self.n_parameters), bool)
         free[:, :2] = (periods > 0)[:, None]
         free[enough] = True

@@ -379,6 +379,6 @@ def _coverage(campaign, solved):
     seen = solved.weights > 0
     if len(seen) and not seen.any():
         return (NOBODY,)
-    if len(seen) and np.ptp(campaign.years) > 0 and not solved.enough.any():
+    if len(seen) and campaign.has_times_enough and not solved.enough.any():
         return (NO_OVERLAP,)
     return ()

@@ -43,7 +43,12 @@ from photutils_mgauss.sky.tangent_plane import (
     local_axes,
     unit_vectors,
 )
-from photutils_mgauss.utils.validation import as_floats, as_real, as_rng
+from photutils_mgauss.utils.validation import (
+    as_floats,
+    as_real,
+    as_rng,
+    shown,
+)
 
 _LIGHT_SPEED = 299792.458 * u.km / u.s
 _LIGHT_YEARS = (u.au / _LIGHT_SPEED).to_value(u.yr)  # in one au
@@ -274,8 +279,16 @@ def _tdb(time):
         # any motion could show.
         warnings.simplefilter('ignore', ErfaWarning)
         if not isinstance(time, Time):
-            time = Time(time, scale='utc')
+            time = _read_time(time)
         return time.tdb
+
+
+def _read_time(time):
+    try:
+        return Time(time, scale='utc')
+    except ValueError as error:
+        msg = f'time must be a Time or a date, got {shown(time)}'
+        raise ValueError(msg) from error
 
 
 def _turn(vectors, start, end):

@@ -55,7 +55,10 @@ class TangentPlane:
     @classmethod
     def around(cls, vectors):
         """Return the plane touching the sky at the mean of directions."""
-        mean = np.nanmean(vectors.reshape(3, -1), axis=1)
+        vectors = vectors.reshape(3, -1)
+        if not np.isfinite(vectors).any():
+            return cls(0.0, 0.0)  # there is nothing to be near to
+        mean = np.nanmean(vectors, axis=1)
         return cls(*(float(angle) for angle in directions(mean)))
 
     @cached_property

@@ -183,3 +183,11 @@ def test_photometry_on_the_sky_has_the_scatter_of_the_pixels(
 def test_wrong_images_are_refused(images, error):
     with pytest.raises(error, match=r'images|wcs'):
         fit_many(images, SkyCoord([150], [40], unit='deg'))
+
+
+def test_a_table_without_a_measured_star_has_no_places():
+    table = QTable({'x_fit': [np.nan], 'y_fit': [np.nan], 'x_err': [np.nan],
+                    'y_err': [np.nan]})
+    places = add_sky_positions(table, make_wcs())
+    assert np.isnan(places['ra'].value).all()
+    assert np.isnan(places['ra_error'].value).all()

@@ -534,6 +534,17 @@ def test_stars_that_no_image_shows_are_not_numbers_and_flagged(rng):
         assert row['flags'] & 4
 
 
+def test_too_few_times_for_a_parallax_are_said(rng):
+    stars = truth([30.0], [30])
+    images = observe(stars, 1000.0, (2025.0, 2027.0), rng)
+    solution, said = fit_with_notes(images, stars['ra', 'dec'], parallax=True)
+    assert said == ('Motions with a parallax take images at 3 times or more, '
+                    'got 2: positions and fluxes are fitted, motions are not.')
+    assert np.isnan(solution.stars['pmra'].value).all()
+    _, said = fit_with_notes(images, stars['ra', 'dec'])
+    assert said == ''
+
+
 def test_images_that_do_not_overlap_are_said(rng):
     stars = truth([20.0, 1020.0], [30, 30])
     frames = [make_wcs(), make_wcs(shift=(-1000, 0))]

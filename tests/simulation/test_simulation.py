@@ -380,6 +380,11 @@ def test_a_distortion_of_higher_order_is_refused():
         Exposure(distortion=distortion)
 
 
+def test_a_time_that_is_none_is_named():
+    with pytest.raises(ValueError, match=r"Time or a date, got 'yesterday'$"):
+        Exposure('yesterday')
+
+
 # Files.
 
 @pytest.fixture(scope='module')
