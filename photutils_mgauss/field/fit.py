@@ -47,6 +47,7 @@ from photutils_mgauss.field.input import (
     possible_degree,
     read_exposures,
     read_sample,
+    warn_of_sky,
 )
 from photutils_mgauss.field.misfit import misfit
 from photutils_mgauss.field.mixture_field import MixtureField
@@ -264,6 +265,8 @@ def field_of_stars(data, stars, error, mask, options, *, executor=None,
     """
     given = data, stars, error, mask
     sample, radius = _read(given, options)
+    if not options.local_bkg:
+        warn_of_sky(sample)
     if options.correlated_noise:
         allow_for_correlation(sample)
     n_components, degree = options.size(sample.n_places)

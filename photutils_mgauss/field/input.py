@@ -29,6 +29,13 @@ _MAX_NEIGHBOURS = 12
 # What is light and what noise, for one star and for all together [standard
 # deviations].
 _SEEN, _SEEN_TOGETHER = 3.0, 5.0
+# An image has a sky if its median exceeds the scatter of its pixels by this
+# factor, and if the sky is more than this share of the light in most stamps.
+# The first spares images whose sky was taken away, the second those in which
+# noise is low.
+_SKY_ABOVE, _SKY_SHARE = 3.0, 0.1
+# Pixels whose median is taken: some thousandths of their scatter are enough.
+_LOOKED_AT = 1e5
 # Stars needed for each term of the polynomials, beyond the first.
 _STARS_PER_TERM = 2
 
@@ -65,6 +72,8 @@ class Sample:
         Their scales, if there are any.
     star, place : (n,) `~numpy.ndarray` of int
         Which star, and at which place of the detector, each is.
+    levels : list of (float, float)
+        The median of the good pixels of each exposure, and their scatter.
     """
 
     stamps: Stamps
@@ -82,6 +91,7 @@ class Sample:
     contexts: Contexts | None
     star: np.ndarray
     place: np.ndarray
+    levels: list
 
     @property
     def n_places(self):
@@ -175,7 +185,8 @@ def read_sample(data, stars, error, mask, radius, gain, contexts=()):
          for (pixels, _), part in zip(exposures, parts, strict=True)],
         np.ones(len(parts)), values,
         Contexts.of_stars(contexts, values) if contexts else None,
-        star, places(star, *where, exposures[0][0].shape))
+        star, places(star, *where, exposures[0][0].shape),
+        [_level(pixels) for pixels, _ in exposures])
 
 
 def _no_star(sources):
@@ -214,6 +225,37 @@ def _correlation(pixels, sources, radius):
         pixels.data, np.broadcast_to(error, pixels.shape),
         np.empty((0, 0)) if pixels.mask is None else pixels.mask, sources.x,
         sources.y, radius)
+
+
+def _level(pixels):
+    """Return the median of the good pixels of an image and their scatter."""
+    step = max(1, int(np.sqrt(np.prod(pixels.shape) / _LOOKED_AT)))
+    data = np.asarray(pixels.data)[::step, ::step]
+    good = np.isfinite(data)
+    if pixels.mask is not None and pixels.mask.size:
+        good &= ~pixels.mask[::step, ::step]
+    if not good.any():
+        return 0.0, 0.0
+    return float(np.median(data[good])), float(mad_std(data[good]))
+
+
+def warn_of_sky(sample):
+    """Warn if images have a sky that the PSF would take for its wings."""
+    stamps = sample.stamps
+    for e, (level, scatter) in enumerate(sample.levels):
+        own = sample.exposure == e
+        light = np.where(stamps.good[own], stamps.data[own], 0).sum(
+            axis=(1, 2))
+        sky = level * stamps.good[own].sum(axis=(1, 2))
+        if (level > _SKY_ABOVE * scatter
+                and (sky > _SKY_SHARE * light).sum() > own.sum() / 2):
+            warnings.warn(
+                f'the image has a background of {level:.4g}, which is '
+                f'{level / scatter if scatter else np.inf:.0f} times the '
+                'scatter of its pixels and '
+                f'{np.median(sky / light):.0%} of the light in the stamps of '
+                'stars, and the PSF would contain it: subtract it, or give '
+                'local_bkg=True', AstropyUserWarning, stacklevel=4)
 
 
 def allow_for_correlation(sample):

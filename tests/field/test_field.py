@@ -208,6 +208,18 @@ def test_one_absurdly_bright_blend_is_dropped(stars, clean):
     assert profile_error(field, 60, 60) < 0.015
 
 
+@pytest.mark.parametrize('error', [None, 25.0])
+def test_a_sky_that_was_not_subtracted_is_warned_of(stars, clean, rng, error):
+    data, some = 500 + clean + rng.normal(0, 25, SHAPE), stars[::6]
+    given = {'error': error, 'n_components': 2, 'degree': 0, 'radius': 10}
+    # Warnings are errors here, and the first one ends the fit.
+    with pytest.raises(AstropyUserWarning, match=r'the image has a background '
+                       r'of 50\d\.?\d*, which .* local_bkg=True$'):
+        fit_mixture_field(data, some, **given)
+    fit_mixture_field(data, some, local_bkg=True, **given)
+    fit_mixture_field(data - 500, some, **given)
+
+
 def test_cosmic_rays_are_left_out(stars, clean):
     rng = np.random.default_rng(5)
     data, error, _ = noisy(clean, rng)
