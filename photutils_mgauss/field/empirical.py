@@ -21,7 +21,7 @@ from scipy.sparse.linalg import LinearOperator, lsqr
 
 from photutils_mgauss.field import stages
 from photutils_mgauss.field.base import lattice
-from photutils_mgauss.field.fit import field_of_stars
+from photutils_mgauss.field.fit import field_of_stars, warn_of_lost
 from photutils_mgauss.field.input import normalised, read_sample
 from photutils_mgauss.field.mixture_field import MixtureField
 from photutils_mgauss.field.options import FieldOptions
@@ -133,6 +133,7 @@ class EmpiricalPSF(ComparedByValue):
                 data, stars, error, mask, FieldOptions(
                     n_components, degree, radius, normalise='stamps'),
                 executor=executor)
+            warn_of_lost(field, stacklevel=3)
             problem = _Lattice.of(field, oversampling)
             target, weights = _corrections(field, read_sample(
                 data, stars, error, mask, field.radius, None).stamps)

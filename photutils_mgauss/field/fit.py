@@ -239,6 +239,7 @@ def fit_mixture_field(data, stars, *, error=None, mask=None, n_components=None,
     how = {'executor': executor, 'progress_bar': progress_bar}
     with waiting('fit_mixture_field', progress_bar):
         field = field_of_stars(*given, options, **how)
+        warn_of_lost(field, stacklevel=3)
         if options.start is None and isinstance(options.n_components, int):
             warn_of_few(field, lambda n: field_of_stars(*given, replace(
                 options, n_components=n, degree=field.degree,
@@ -286,6 +287,20 @@ def field_of_stars(data, stars, error, mask, options, *, executor=None,
         return field
     return _with_wings(field, sample, read_exposures(*given),
                        options.normalise)
+
+
+def warn_of_lost(field, *, stacklevel):
+    """Warn if so many stars of a list are not used that it may be wrong."""
+    n_stars = np.count_nonzero(field.stars['used']) + len(field.dropped)
+    reasons = [str(reason) for reason in field.dropped['reason']]
+    if len(reasons) <= max(_LOST * n_stars, _FEWEST_LOST - 1):
+        return
+    counts = ', '.join(f'{reasons.count(reason)} {reason}'
+                       for reason in sorted(set(reasons)))
+    warnings.warn(
+        f'{len(reasons)} of the {n_stars} stars given are not used ({counts}):'
+        ' check that x and y are those of this image, and that error and mask '
+        'are right', AstropyUserWarning, stacklevel=stacklevel)
 
 
 def _read(given, options):
@@ -488,24 +503,9 @@ def _result(fit, sample, radius, choice, centre, fatter):
         warn_of_phase(middle)
     stddev = _centre_stddev(middle, radius, centre, field.pixel_integrated)
     table = star_table(fit, sample, stddev)
-    _warn_of_lost(field.dropped, table)
     if centre == 'catalogue':
         field = _moved(field, table, fit, core_width(middle))
     return replace(field, stars=table, centre_stddev=stddev)
-
-
-def _warn_of_lost(dropped, table):
-    """Warn if so many stars are not used that the list may be wrong."""
-    n_stars = np.count_nonzero(table['used']) + len(dropped)
-    reasons = [str(reason) for reason in dropped['reason']]
-    if len(reasons) <= max(_LOST * n_stars, _FEWEST_LOST - 1):
-        return
-    counts = ', '.join(f'{reasons.count(reason)} {reason}'
-                       for reason in sorted(set(reasons)))
-    warnings.warn(
-        f'{len(reasons)} of the {n_stars} stars given are not used ({counts}):'
-        ' check that x and y are those of this image, and that error and mask '
-        'are right', AstropyUserWarning, stacklevel=6)
 
 
 def _context_parts(fit, sample, n_terms):

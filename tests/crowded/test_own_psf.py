@@ -28,6 +28,7 @@ from photutils_mgauss import (
     simulate,
 )
 from photutils_mgauss.crowded import psf_loop
+from photutils_mgauss.field import fit as field_fit
 from photutils_mgauss.field.growth import Wings
 from photutils_mgauss.utils.image import read_pixels
 
@@ -228,6 +229,29 @@ def test_a_psf_that_still_changes_is_said():
     with pytest.warns(AstropyUserWarning, match='still changes .* after '
                                                 'max_passes=1'):
         fit_crowded_psf(**image(), **QUICK, max_passes=1)
+
+
+@unfinished
+def test_only_what_concerns_the_last_psf_is_said(monkeypatch):
+    number, real = [], psf_loop.field_of_stars
+
+    def outspoken(*given):
+        number.append(len(number))
+        warnings.warn(f'fit {number[-1]}', AstropyUserWarning, stacklevel=1)
+        return real(*given)
+    monkeypatch.setattr(psf_loop, 'field_of_stars', outspoken)
+    with pytest.warns(AstropyUserWarning, match='fit') as told:
+        fit_crowded_psf(**corner(), **SHORT)
+    said = [str(one.message) for one in told]
+    assert [one for one in said if one[:3] == 'fit'] == [f'fit {number[-1]}']
+    assert len(number) > 3
+
+
+@unfinished
+def test_where_no_list_is_given_no_stars_of_it_are_missing(monkeypatch):
+    monkeypatch.setattr(field_fit, '_LOST', -1)
+    monkeypatch.setattr(field_fit, '_FEWEST_LOST', 0)
+    fit_crowded_psf(**corner(), **SHORT)
 
 
 @pytest.mark.parametrize(('changes', 'words'), [
