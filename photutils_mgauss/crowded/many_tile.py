@@ -18,7 +18,7 @@ from photutils_mgauss.crowded.many_equations import (
     reach_of,
 )
 from photutils_mgauss.crowded.model import Model
-from photutils_mgauss.crowded.stars import Neighbours, Stars
+from photutils_mgauss.crowded.stars import Neighbours, Stars, reach_of_pairs
 from photutils_mgauss.crowded.tile import (
     CELL,
     REST,
@@ -120,7 +120,7 @@ class SharedModel(Model):
     def __init__(self, job):
         self.slopes = np.empty((0, 2, 2))
         super().__init__(job)
-        self.neighbours = Neighbours.of(np.empty(0), np.empty(0))
+        self.neighbours = Neighbours.of(np.empty(0), np.empty(0), 0.0)
 
     def _connect(self):
         """Leave the list of neighbours as the tile has made it."""
@@ -263,7 +263,9 @@ class ManyTile(Searched):
     def _connect(self, stars, slopes):
         """Take over stars of slopes (E, n, 2, 2); find who is beside whom."""
         self.stars = stars
-        self.neighbours = Neighbours.of(stars.x, stars.y, max(self.pixels))
+        self.neighbours = Neighbours.of(stars.x, stars.y, max(
+            size * reach_of_pairs(model.psf.area)
+            for model, size in zip(self.models, self.pixels, strict=True)))
         for model, own in zip(self.models, slopes, strict=True):
             model.neighbours = self.neighbours
             model.slopes = own

@@ -16,7 +16,7 @@ import numpy as np
 from photutils_mgauss import kernels
 from photutils_mgauss.crowded.background import Mesh
 from photutils_mgauss.crowded.diffuse import Diffuse
-from photutils_mgauss.crowded.stars import Neighbours, Stars
+from photutils_mgauss.crowded.stars import Neighbours, Stars, reach_of_pairs
 from photutils_mgauss.psf.wings import WINGS
 
 # Fit stamps are 7 or 9 pixels wide, 13 for bright stars: almost all of the
@@ -166,7 +166,7 @@ class Model:
 
     def _connect(self):
         self.neighbours = Neighbours.of(self.stars.x, self.stars.y,
-                                        self.psf.scale)
+                                        reach_of_pairs(self.psf.area))
 
     def take(self, step, level_step):
         """Change the stars by a step (n, 3), and the level; draw nothing."""

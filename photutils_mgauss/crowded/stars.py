@@ -6,9 +6,11 @@ from scipy.spatial import cKDTree
 
 from photutils_mgauss import kernels
 
-# Stars further apart than this are not solved for together [pix]; they still
-# see each other through the residual.
-_PAIR_DISTANCE = 5.0
+# Stars further apart than this [pix], and than so many times the root of the
+# PSF's area, are not solved for together; they still see each other through
+# the residual. Where stars that share much light are left out, the equations
+# of all have no minimum, and steps throw bright stars away.
+_PAIR_DISTANCE, _PAIR_WIDTHS = 5.0, 1.5
 
 
 class Stars:
@@ -114,6 +116,11 @@ class Stars:
         self.flux_init[which] = self.flux[which]
 
 
+def reach_of_pairs(area):
+    """Return how far stars of a PSF [pix^2] are solved for together [pix]."""
+    return max(_PAIR_DISTANCE, _PAIR_WIDTHS * np.sqrt(area))
+
+
 @dataclass(frozen=True)
 class Neighbours:
     """
@@ -131,14 +138,9 @@ class Neighbours:
     distance: np.ndarray
 
     @classmethod
-    def of(cls, x, y, scale=1.0):
-        """
-        List the pairs of stars that are solved for together.
-
-        ``scale`` is the size of a pixel in units of x and y.
-        """
-        owner, neighbour, gap, twin = _close_pairs(
-            x, y, scale * _PAIR_DISTANCE)
+    def of(cls, x, y, reach):
+        """List the pairs of stars within reach of each other."""
+        owner, neighbour, gap, twin = _close_pairs(x, y, reach)
         count = np.bincount(owner, minlength=x.size)
         indptr = np.concatenate([[0], np.cumsum(count)])
         has = count > 0

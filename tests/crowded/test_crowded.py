@@ -233,7 +233,7 @@ def test_wings_are_those_of_the_exact_gaussian(rng):
 def test_neighbours_are_listed_both_ways():
     rng = np.random.default_rng(1)
     x, y = rng.uniform(0, 30, (2, 60))
-    pairs = Neighbours.of(x, y)
+    pairs = Neighbours.of(x, y, 5.0)
     assert (pairs.owner[pairs.twin] == pairs.neighbour).all()
     assert (pairs.neighbour[pairs.twin] == pairs.owner).all()
 
