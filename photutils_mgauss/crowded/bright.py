@@ -63,20 +63,28 @@ def least_fluxes(model):
     A companion beside the hidden middle of a star and that star trade light,
     and both go away from where they are.
     """
-    clumps, n = label(~model.good, np.ones((3, 3)))
-    s, flux = model.stars, np.zeros(n + 1)
-    x, y = (np.rint(place[s.seeded]).astype(int) for place in (s.x, s.y))
-    ny, nx = model.data.shape
-    inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
-    np.maximum.at(flux, clumps[y[inside], x[inside]],
-                  s.flux[s.seeded][inside])
-    flux[0] = 0
+    s, flux = model.stars, np.zeros(model.data.shape)
+    for i in np.flatnonzero(s.seeded):
+        # A clump may also be a trail or a bad column, which reach further than
+        # the star is hidden; a square has its corners this far away.
+        reach = np.sqrt(2) * s.core[i] + 0.5
+        part, distance = _around(s.x[i], s.y[i], reach, flux.shape)
+        hidden = ~model.good[part] & (distance <= reach)
+        flux[part][hidden] = np.maximum(flux[part][hidden], s.flux[i])
     if not flux.any():
-        return np.zeros(model.data.shape)
-    distance, nearest = distance_transform_edt(flux[clumps] == 0,
-                                               return_indices=True)
-    return np.where(distance <= BESIDE,
-                    DOUBTFUL * flux[clumps[tuple(nearest)]], 0)
+        return flux
+    distance, nearest = distance_transform_edt(flux == 0, return_indices=True)
+    return np.where(distance <= BESIDE, DOUBTFUL * flux[tuple(nearest)], 0)
+
+
+def _around(x, y, reach, shape):
+    """Return a square (slice, slice) around a place, and distances in it."""
+    part = tuple(slice(max(0, int(np.floor(place - reach))),
+                       max(0, int(np.ceil(place + reach)) + 1))
+                 for place in (y, x))
+    row, column = (np.arange(one.start, min(one.stop, n))
+                   for one, n in zip(part, shape, strict=True))
+    return part, np.hypot(row[:, None] - y, column - x)
 
 
 def size_differences(model):

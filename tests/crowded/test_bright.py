@@ -74,6 +74,24 @@ def test_a_star_that_is_too_bright_for_that_is_found():
     assert star['flux_fit'] == pytest.approx(1e5, rel=0.05)
 
 
+def test_a_bad_column_through_a_bright_star_hides_no_stars_beside_it():
+    y = np.arange(10.0, 200, 10)
+    x = np.where(np.arange(y.size) % 2, 31.3, 28.2)
+    flux = np.full(y.size, 3000.0)
+    x[9], flux[9] = 29.9, 1e6
+    light = SKY + sum(mixture(0).render((210, 60), *star, flux=brightness)
+                      for *star, brightness in zip(x, y, flux, strict=True))
+    bad = np.zeros(light.shape, bool)
+    bad[:, 30] = True
+    table = CrowdedMixturePhotometry(PSF)(
+        np.random.default_rng(1).normal(light, np.sqrt(light)),
+        error=np.sqrt(light), mask=bad)
+    gap = np.hypot(table['x_fit'] - x[:, None],
+                   table['y_fit'] - y[:, None]).min(axis=1)
+    assert (gap < 0.3).all()
+    assert table.meta['reduced_chi2'] < 1.1
+
+
 def test_it_is_the_same_in_many_images():
     wcs = WCS(naxis=2)
     wcs.wcs.ctype = 'RA---TAN', 'DEC--TAN'
