@@ -40,9 +40,10 @@ def psf_section(path):
     for name, words in (('n_stars', 'Stars used for the PSF'),
                         ('degree', 'Degree over the detector'),
                         ('accuracy', 'Relative error left')):
-        if record.get(name):
-            value = record[name]
-            facts[words] = f'{value:.2g}' if name == 'accuracy' else value
+        value = record.get(name)
+        if value is not None:
+            facts[words] = value if name != 'accuracy' else (
+                f'{value:.2g}' if value > 0 else 'none beyond the noise')
     panels = [Panel(lambda ax: plotting.plot_psf_image(psf, *middle, ax=ax),
                     'The PSF in the middle of the detector.'),
               Panel(lambda ax: plotting.plot_radial_profile(psf, *middle,

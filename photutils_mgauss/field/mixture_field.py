@@ -106,7 +106,10 @@ class MixtureField(Field):
         at pixels that were not used.
     accuracy : float
         The relative error of the PSF, determined from the chi^2 of the
-        stars.
+        stars, two standard errors below the median of what they say. 0
+        means that these stars show no misfit beyond their noise, not that
+        there is none; what the noise of the stars leaves open is in the
+        errors of the PSF.
     dropped : `~astropy.table.QTable`
         ``id`` and ``reason`` of the stars that were not used.
     choice : `~astropy.table.QTable`

@@ -81,6 +81,16 @@ def test_a_psf_that_misses_much_of_the_light_is_not_good(
     assert ('it misses 3.0% of the light' in verdict.words) != good
 
 
+def test_a_misfit_within_the_noise_is_put_into_words(tmp_path):
+    PSF.write(tmp_path / 'psf.fits')
+    with fits.open(tmp_path / 'psf.fits', mode='update') as hdus:
+        hdus[0].header['MGRUN'] = json.dumps(
+            {'n_stars': 11, 'degree': 0, 'accuracy': 0.0})
+    facts = section_of(tmp_path / 'psf.fits').facts
+    assert facts['Relative error left'] == 'none beyond the noise'
+    assert facts['Degree over the detector'] == 0
+
+
 def test_the_page_begins_with_the_verdicts(measured):
     page = html_page('title', [section_of(measured)],
                      {'date': 'today', 'version': '1'})
