@@ -13,6 +13,9 @@ from photutils_mgauss.photometry.psf_photometry import MixturePSFPhotometry
 
 # Peaks of so many standard errors are looked at, the brightest of them.
 _BRIGHT, _MOST = 30.0, 300
+# A peak is the highest of a square of twice the first and a middle pixel, and
+# is fitted in one of twice the second [pix], of wide PSFs in larger ones.
+_PEAK, _FIT = 3, 2
 # Stars of two images are the same within the second of these distances of the
 # offset that most pairs have, offsets are searched to the first [pix].
 _FARTHEST, _SAME = 10.0, 0.5
@@ -20,7 +23,7 @@ _FARTHEST, _SAME = 10.0, 0.5
 _TOLD, _SURE, _FEWEST = 0.1, 6.0, 8
 
 
-def tell_of_misplaced(field, models, *, motions):
+def tell_of_misplaced(field, models, scales, *, motions):
     """
     Warn of images whose bright stars lie beside those of the others.
 
@@ -28,12 +31,14 @@ def tell_of_misplaced(field, models, *, motions):
     ----------
     field : `~photutils_mgauss.photometry.many_images.Field`
     models : (E,) list of GriddedMixturePSF or MultiGaussianPSFModel
+    scales : (E,) list of float
+        By what lengths exceed those that suit narrow PSFs.
     motions : bool
         Whether stars may move together, at a constant rate.
     """
-    places = [_places(pixels, model, field.grid.to_grid[k])
-              for k, (pixels, model) in enumerate(
-                  zip(field.pixels, models, strict=True))]
+    places = [_places(pixels, model, scale, field.grid.to_grid[k])
+              for k, (pixels, model, scale) in enumerate(
+                  zip(field.pixels, models, scales, strict=True))]
     first = int(np.argmax([place.shape[1] for place in places]))
     offsets, errors = (np.array(part) for part in zip(*(
         _offset(places[first], place) for place in places), strict=True))
@@ -74,7 +79,7 @@ def _others(wrong, worst):
     return f' (and of {others}, too)' if others else ''
 
 
-def _places(pixels, model, to_grid):
+def _places(pixels, model, scale, to_grid):
     """Return where bright stars are on the grid of the field (2, n)."""
     data, variance = pixels.part()
     good = variance > 0
@@ -85,12 +90,13 @@ def _places(pixels, model, to_grid):
     with warnings.catch_warnings():
         # There may be no peaks; stars may be anything.
         warnings.simplefilter('ignore')
-        peaks = find_peaks(sharp, _BRIGHT, box_size=7, n_peaks=_MOST,
-                           mask=~good)
+        peaks = find_peaks(sharp, _BRIGHT, n_peaks=_MOST, mask=~good,
+                           box_size=2 * round(scale * _PEAK) + 1)
         if peaks is None or len(peaks) < _FEWEST:
             return np.zeros((2, 0))
         table = MixturePSFPhotometry(
-            model, 5, fit_sky=True, xy_bounds=1.0, aperture_radius=2.5)(
+            model, 2 * round(scale * _FIT) + 1, fit_sky=True,
+            xy_bounds=scale, aperture_radius=scale * (_FIT + 0.5))(
             data, error=np.where(good, error, 1), mask=~good,
             init_params=QTable({'x': peaks['x_peak'], 'y': peaks['y_peak']}))
     x, y = (np.asarray(table[f'{name}_fit']) for name in 'xy')

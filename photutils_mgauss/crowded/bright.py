@@ -3,12 +3,12 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, find_objects, label
 
 from photutils_mgauss.crowded.stars import Stars
-from photutils_mgauss.psf.wings import WINGS, place_behind
+from photutils_mgauss.psf.wings import place_behind, reach_of_wings
 
 # Groups of bad pixels of up to this many may hide a saturated star.
 _SATURATED_PIXELS = (2, 2000)
-# Within this distance of what a saturated star hides [pix], whatever is
-# fainter than this part of it is what the PSF leaves of it.
+# Within this distance of what a saturated star hides [pix], of wide PSFs it is
+# more, whatever is fainter than this part of it is what the PSF leaves of it.
 BESIDE, DOUBTFUL = 2.3, 0.01
 
 
@@ -31,7 +31,7 @@ def _wing_star(model, data, box, clump):
     if wings is None:
         return None
     column, row = round(x), round(y)
-    half = core + WINGS
+    half = core + reach_of_wings(model.psf)
     ny, nx = model.data.shape
     part = (slice(max(0, row - half), min(ny, row + half + 1)),
             slice(max(0, column - half), min(nx, column + half + 1)))
@@ -74,7 +74,8 @@ def least_fluxes(model):
     if not flux.any():
         return flux
     distance, nearest = distance_transform_edt(flux == 0, return_indices=True)
-    return np.where(distance <= BESIDE, DOUBTFUL * flux[tuple(nearest)], 0)
+    return np.where(distance <= model.psf.scale * BESIDE,
+                    DOUBTFUL * flux[tuple(nearest)], 0)
 
 
 def _around(x, y, reach, shape):

@@ -14,7 +14,7 @@ from photutils_mgauss.photometry.bright_residual import (
     without_surroundings,
 )
 from photutils_mgauss.psf.residual import PSFResidual
-from photutils_mgauss.psf.wings import WINGS
+from photutils_mgauss.psf.wings import reach_of_wings
 
 # Of stars fainter than this part of the faintest saturated one, hidden stars
 # beside them are too large a part.
@@ -51,7 +51,7 @@ def left_of_bright(tile):
     if not telling.any():
         return None, ~own
     stars = np.stack([s.x, s.y, s.flux])
-    reach = int(s.core[s.seeded].max()) + WINGS
+    reach = int(s.core[s.seeded].max()) + reach_of_wings(tile.model.psf)
     beside = pixels_beside(stars[:, telling | s.seeded], tile.least.shape,
                            reach)
     left = _with_faint(

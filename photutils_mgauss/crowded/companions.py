@@ -101,7 +101,8 @@ def _moves(model, star, doubt, flux):
     seen = (others**2 / (variance + doubt[row, column]**2)[:, None]).sum(
         axis=0) * np.maximum(left, LEAST)
     hidden = ndtr(model.options.faintest - flux * np.sqrt(seen)[:, None])
-    hidden[(left < LEAST) | (np.hypot(dx, dy) < SEPARATION)] = 1
+    hidden[(left < LEAST)
+           | (np.hypot(dx, dy) < model.psf.scale * SEPARATION)] = 1
     beside = _beside(model, x, y, reach)[dy + reach, dx + reach]
     hidden[np.ix_(beside, flux < DOUBTFUL * s.flux[star])] = 1
     # What is brighter than the star would be the saturated one itself.
@@ -111,12 +112,13 @@ def _moves(model, star, doubt, flux):
 
 def _beside(model, x, y, reach):
     """Tell which pixels around a place are masked or next to such (w, w)."""
-    more = reach + int(np.ceil(BESIDE))
+    far = model.psf.scale * BESIDE
+    more = reach + int(np.ceil(far))
     good = np.ones((2 * more + 1,) * 2, bool)
     ny, nx = model.good.shape
     rows, columns = (np.arange(at - more, at + more + 1) for at in (y, x))
     r, c = ((at >= 0) & (at < n) for at, n in ((rows, ny), (columns, nx)))
     good[np.ix_(r, c)] = model.good[np.ix_(rows[r], columns[c])]
     inner = slice(more - reach, more + reach + 1)
-    return (distance_transform_edt(np.pad(good, 1))[1:-1, 1:-1] <= BESIDE)[
+    return (distance_transform_edt(np.pad(good, 1))[1:-1, 1:-1] <= far)[
         inner, inner]

@@ -27,8 +27,8 @@ from scipy.special import ndtr
 from photutils_mgauss import kernels
 from photutils_mgauss.crowded.search import LEAST
 
-# Numbers of stars are those of blocks of so many pixels a side, smoothed by a
-# Gaussian of so many blocks.
+# Numbers of stars are those of blocks of so many pixels a side, of wide PSFs
+# more, smoothed by a Gaussian of so many blocks.
 _BLOCK, _SMOOTH = 8, 2.5
 # Stars of so many standard errors are counted: in a crowd nine in ten of them
 # are found, and of fainter ones fewer, which would make counts too flat.
@@ -183,8 +183,9 @@ class _Blocks:
     """Sums over the stars around each star."""
 
     def __init__(self, model, origin):
+        self.side = side = round(model.psf.scale * _BLOCK)
         self.shape = tuple(
-            (first + n - 1) // _BLOCK - first // _BLOCK + 1
+            (first + n - 1) // side - first // side + 1
             for first, n in zip(origin, model.data.shape, strict=True))
         s, (ny, nx) = model.stars, model.data.shape
         y, x = np.nonzero(model.good)
@@ -196,9 +197,8 @@ class _Blocks:
         one[15, 15] = 1
         self.own = gaussian_filter(one, _SMOOTH)[15, 15]
 
-    @staticmethod
-    def _block(origin, y, x):
-        return (tuple((first % _BLOCK + place) // _BLOCK
+    def _block(self, origin, y, x):
+        return (tuple((first % self.side + place) // self.side
                       for first, place in zip(origin, (y, x), strict=True)))
 
     def _sum(self, block, worth=None):

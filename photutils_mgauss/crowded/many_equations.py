@@ -155,8 +155,8 @@ class ManyEquations:
         error = self.flux_errors()
         light = np.clip(light, -np.maximum(_LARGEST_FALL * flux, error),
                         np.maximum((MOST_CHANGE - 1) * flux, error))
-        reach = reach_of(self.factors)
-        move = np.clip(place, -MAX_MOVE / reach, MAX_MOVE / reach)
+        most = tile.scale * MAX_MOVE / reach_of(self.factors)
+        move = np.clip(place, -most, most)
         bound, drift = tile.stars.bound[:, None], self.drift[:, :2]
         move[:, :2] = np.where(np.isfinite(bound), np.clip(
             move[:, :2], -bound - drift, bound - drift), move[:, :2])

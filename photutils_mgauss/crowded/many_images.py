@@ -65,17 +65,20 @@ def fit_images(images, listed, settings, *, motions):
         u, v = grid_positions(listed, field.grid)
         given = Stars(u, v, np.zeros(u.size), number=np.arange(u.size),
                       bound=settings.bound)
-    each = [settings.options_of(one) for one in field.pixels]
     models = [settings.model_of(pixels) if psf is None else psf
               for psf, pixels in zip(field.psfs, field.pixels, strict=True)]
-    tell_of_misplaced(field, models, motions=motions)
+    psfs = _local(models)
+    scales = [psf.scale for psf in psfs]
+    each = [settings.options_of(pixels).widened(scale)
+            for pixels, scale in zip(field.pixels, scales, strict=True)]
+    tell_of_misplaced(field, models, scales, motions=motions)
     plan = ManyPlan(
-        field.pixels, _local(models),
+        field.pixels, psfs,
         # What is known of fluxes and places is said once for all images.
         [replace(one, count_slope=0.0) for one in each],
-        replace(each[0], gain=None), field.grid,
+        replace(each[int(np.argmax(scales))], gain=None), field.grid,
         np.ones(len(each)), _factors(field, motions), _bands(field, motions),
-        settings.tile_shape, settings.overlap, given,
+        settings.tile_shape, round(settings.overlap * max(scales)), given,
         settings.checkpoint).with_scales()
     outcomes, errors = run(plan, settings.executor, settings.progress_bar)
     left = [core for core, outcome in zip(plan.cores, outcomes, strict=True)

@@ -13,6 +13,7 @@ import numpy as np
 
 from photutils_mgauss import kernels
 from photutils_mgauss.crowded.search import (
+    FREE,
     LEAST,
     REACH,
     SEPARATION,
@@ -36,8 +37,9 @@ def find(tile, threshold, found_in):
     safe = np.where(known > 0, known, 1)
     light[known <= 0] = 0
     y, x, found = peaks(light / np.sqrt(safe), light / safe, threshold,
-                        found_in)
-    good = apart(found, tile.stars, tile.rejected) & _told(tile, found)
+                        found_in, tile.scale)
+    good = apart(found, tile.stars, tile.rejected, tile.scale) & _told(
+        tile, found)
     fluxes = []
     for c, one in zip(tile.job.scales, every, strict=True):
         own = one.information[y, x]
@@ -92,10 +94,12 @@ def _ask_beside(tile, k, light, wanted, out):
     model = tile.models[k]
     fit = kernels.Fit(model.stars.sources, model.stamps,
                       tile.neighbours.pairs, tile.equations.each[k].stars)
-    side = int(np.ceil(REACH * tile.pixels[k])) + 1
+    reach = model.psf.scale * REACH
+    side = int(np.ceil(reach * tile.pixels[k])) + 1
     kernels.evidence_beside(
         tile.stars.x, tile.stars.y, fit, tile.points[k], tile.phases[k],
-        model.planes(light), kernels.Limits(REACH, LEAST, 0.0), side, wanted,
+        model.planes(light), kernels.Limits(
+            reach, model.psf.scale * FREE, LEAST, 0.0), side, wanted,
         kernels.BesideScratch.empty(), out)
 
 
@@ -109,7 +113,7 @@ def leave_out(tile, threshold):
     if threshold >= tile.options.keep and tile.stars.rate.shape[1]:
         least[_beside(tile, REACH)] = tile.options.threshold
     weak = weakest(tile.stars, tile.neighbours, strengths(tile), least,
-                   tile.shape)
+                   tile.shape, tile.scale)
     # Two stars at a place share its light, and seem to move apart.
     weak |= _beside(tile, SEPARATION) & ~tile.stars.listed
     places = np.column_stack([tile.stars.x[weak], tile.stars.y[weak]])
@@ -121,12 +125,14 @@ def _beside(tile, reach):
     """
     Tell which stars are within reach of a brighter one [pix].
 
-    What a PSF that is a little wrong leaves there looks like a weak star,
-    and with it the brighter one is free to move, if stars have motions.
+    Of wide PSFs it is longer. What a PSF that is a little wrong leaves there
+    looks like a weak star, and with it the brighter one is free to move, if
+    stars have motions.
     """
     s, pairs = tile.stars, tile.neighbours
     near = np.hypot(s.x[pairs.owner] - s.x[pairs.neighbour],
-                    s.y[pairs.owner] - s.y[pairs.neighbour]) < reach
+                    s.y[pairs.owner] - s.y[pairs.neighbour]) < (
+                        tile.scale * reach)
     fainter = s.flux[pairs.neighbour] < s.flux[pairs.owner]
     out = np.zeros(len(s), bool)
     out[pairs.neighbour[near & fainter]] = True

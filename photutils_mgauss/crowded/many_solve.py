@@ -9,7 +9,8 @@ from photutils_mgauss.crowded.many_tile import ManyTile
 from photutils_mgauss.crowded.solve import find_all, settle
 from photutils_mgauss.crowded.stars import Stars
 
-# Saturated stars of two images that are nearer than this are one [pix].
+# Saturated stars of two images that are nearer than this are one [pix], of
+# wide PSFs it is more.
 _SAME = 3.0
 
 
@@ -54,7 +55,7 @@ def _saturated(tile):
     keep = np.ones(len(every), bool)
     if len(every):
         tree = cKDTree(np.column_stack([every.x, every.y]))
-        for a, b in sorted(tree.query_pairs(_SAME)):
+        for a, b in sorted(tree.query_pairs(tile.scale * _SAME)):
             if keep[a]:
                 keep[b] = False
     every = every.chosen(keep)

@@ -185,6 +185,12 @@ class ManyTile(Searched):
         return min(model.psf.area * size**2 for model, size in zip(
             self.models, self.pixels, strict=True))
 
+    @property
+    def scale(self):
+        """By what lengths on the grid exceed those of narrow PSFs."""
+        return max(1.0, min(model.psf.scale * size for model, size in zip(
+            self.models, self.pixels, strict=True)))
+
     def ties(self):
         """Return the `~kernels.Ties` of fluxes."""
         tied, bands = self.stars.tied, self.job.bands
@@ -284,7 +290,8 @@ class ManyTile(Searched):
             x, y = one(stars.x + shift[:, 0], stars.y + shift[:, 1])
             ny, nx = model.data.shape
             away = np.maximum(np.maximum(-x, x - nx + 1),
-                              np.maximum(-y, y - ny + 1)) > _OUTSIDE
+                              np.maximum(-y, y - ny + 1)) > (
+                                  model.psf.scale * _OUTSIDE)
             out.append(Stars(x, y, np.where(away, 0, flux),
                              seeded=stars.seeded & ~away,
                              core=stars.core))
@@ -392,8 +399,8 @@ class ManyTile(Searched):
         flux = self.fluxes
         roam = _FREE * self.equations.flux_errors()
         place = self._places()
-        reach = np.minimum(ROAM, self.stars.bound)[:, None] / reach_of(
-            self.job.factors)
+        reach = np.minimum(self.scale * ROAM, self.stars.bound)[
+            :, None] / reach_of(self.job.factors)
         return (np.stack([np.minimum(flux / 2, flux - roam),
                           np.maximum(2 * flux, flux + roam)]),
                 np.stack([place - reach, place + reach]))
@@ -437,7 +444,7 @@ def phases(psf, shape):
     parts = (np.arange(_PHASES) + 0.5) / _PHASES - 0.5
     at = np.meshgrid(x, y)
     stamps = psf.stamps(*(one.ravel().astype(float) for one in at),
-                        _TEMPLATE_HALF, [(dx, dy) for dy in parts
-                                         for dx in parts])
+                        round(psf.scale * _TEMPLATE_HALF),
+                        [(dx, dy) for dy in parts for dx in parts])
     return kernels.Phases(stamps.reshape(
         y.size, x.size, _PHASES, _PHASES, *stamps.shape[2:]), CELL)

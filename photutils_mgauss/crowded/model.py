@@ -17,7 +17,7 @@ from photutils_mgauss import kernels
 from photutils_mgauss.crowded.background import Mesh
 from photutils_mgauss.crowded.diffuse import Diffuse
 from photutils_mgauss.crowded.stars import Neighbours, Stars, reach_of_pairs
-from photutils_mgauss.psf.wings import WINGS
+from photutils_mgauss.psf.wings import reach_of_wings
 
 # Fit stamps are 7 or 9 pixels wide, 13 for bright stars: almost all of the
 # information on a position lies in the core. Of wide PSFs they are wider.
@@ -125,7 +125,8 @@ class Model:
         bright = flux * profile[0] > _BRIGHT_FLUX * self.noise
         half = np.clip(wing, least, np.where(bright, widest, usual))
         seeded = s.seeded[chosen]
-        half[seeded] = np.maximum(widest + 2, s.core[chosen][seeded] + WINGS)
+        half[seeded] = np.maximum(widest + 2, s.core[chosen][seeded]
+                                  + reach_of_wings(self.psf))
         width = 2 * half + 1
         ends = np.concatenate([[0], np.cumsum(width**2)]).astype(np.int64)
         return np.maximum(wing, half).astype(np.int64), kernels.Stamps(

@@ -31,7 +31,7 @@ def fit_crowded_psf(data, *, error=None, mask=None, stars=None,
     `fit_mixture_field` does.
 
     Of images larger than 1536 pixels, five windows of 320 pixels along each
-    long axis are used.
+    long axis are used; for PSFs wider than 3 pixels both are larger.
 
     Parameters
     ----------

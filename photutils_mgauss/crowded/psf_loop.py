@@ -48,10 +48,12 @@ _TOP_DEGREE, _STARS_PER_TERM = 4, 40
 # of each step, it would come no further than photometry says it may be off.
 _REST = 2e-3
 # Of larger images, so many windows of this size along an axis are solved:
-# enough stars for a PSF [pix].
+# enough stars for a PSF [pix], of a wide one both are larger.
 _LARGEST, _WINDOW, _WINDOWS = 1536, 320, 5
-# Where the PSF of two passes is compared, and how far from its centre [pix].
-_PLACES, _REACH = (3, 3), 8
+# Where the PSF of two passes is compared, and in so many steps from its
+# centre. A step is a pixel, or larger in proportion for PSFs wider than this
+# FWHM [pix].
+_PLACES, _REACH, _USUAL_FWHM = (3, 3), 8, 3.0
 # The first PSF is fitted again with longer lengths while it is wider than they
 # are meant for by more than this factor.
 _WIDER, _MOST_WIDER = 1.1, 8
@@ -105,11 +107,13 @@ class CrowdedImage:
 
     ``windows`` are the parts (slice, slice) of the image that are looked at,
     ``gain`` the electrons per unit, infinite if the error has no photons of
-    the stars in it.
+    the stars in it; ``scale`` is by how much the PSF is wider than a narrow
+    one.
     """
 
     pixels: object
     gain: float
+    scale: float = 1.0
 
     @classmethod
     def of(cls, pixels, effective_gain):
@@ -125,16 +129,17 @@ class CrowdedImage:
     @property
     def windows(self):
         """The parts of the image that are solved, (slice, slice) each."""
-        rows, columns = (_spread(n) for n in self.shape)
+        rows, columns = (_spread(n, self.scale) for n in self.shape)
         return [(row, column) for row in rows for column in columns]
 
 
-def _spread(n):
+def _spread(n, scale):
     """Return slices along an axis, all of a short one."""
-    if n <= _LARGEST:
+    if n <= scale * _LARGEST:
         return [slice(0, n)]
-    first = np.linspace(0, n - _WINDOW, _WINDOWS).round().astype(int)
-    return [slice(low, low + _WINDOW) for low in first]
+    size = round(scale * _WINDOW)
+    first = np.linspace(0, n - size, _WINDOWS).round().astype(int)
+    return [slice(low, low + size) for low in first]
 
 
 @dataclass(frozen=True)
@@ -246,6 +251,7 @@ def fit_field(pixels, options, solve, effective_gain=None):
     first, said = _unsaid(first_field, image, options.rules)
     passes, steady = [first], 0
     options = options.widened(passes[0])
+    image = replace(image, scale=options.rules.scale)
     with progress(total=options.max_passes, desc='PSF',
                   shown=options.progress_bar) as bar:
         for number in range(options.max_passes):
@@ -460,11 +466,12 @@ def grid_of(field):
 def difference(field, other):
     """Return by what fraction the PSFs of two fields differ."""
     steps = np.arange(-_REACH, _REACH + 1.0)
-    x, y = np.meshgrid(steps, steps)
     squares = []
     for place in zip(*lattice(_PLACES, field.shape), strict=True):
-        new, old = (one.mixture_at(*place).evaluate(x, y)
-                    for one in (field, other))
+        mixtures = [one.mixture_at(*place) for one in (field, other)]
+        step = max(mixtures[0].fwhm / _USUAL_FWHM, 1.0)
+        x, y = np.meshgrid(step * steps, step * steps)
+        new, old = (mixture.evaluate(x, y) for mixture in mixtures)
         squares.append(((new - old)**2).sum() / (new**2).sum())
     return float(np.sqrt(np.mean(squares)))
 

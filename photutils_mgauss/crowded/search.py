@@ -18,6 +18,8 @@ _HINT = 0.4
 # information is left, the two cannot be told apart.
 REACH = 2.3
 LEAST = 0.05
+# Those of the known stars within this distance are free [pix].
+FREE = 3.0
 # No star is added this close to another, or to one that was taken away [pix].
 SEPARATION = 0.3
 _REJECTED = 0.5
@@ -61,7 +63,7 @@ def _scores(tile, threshold):
     fit = kernels.Fit(model.stars.sources, model.stamps,
                       model.neighbours.pairs, tile.equations.stars)
     kernels.score_beside(fit, templates, model.planes(light),
-                         kernels.Limits(scale * REACH, LEAST,
+                         kernels.Limits(scale * REACH, scale * FREE, LEAST,
                                         float(threshold)),
                          kernels.BesideScratch.empty(), significance, flux)
     return significance, flux

@@ -120,7 +120,8 @@ def evidence_beside(column, row, fit, points, phases, planes, limits, side,
                 if (px[i] - at_x)**2 + (py[i] - at_y)**2 > reach * reach:
                     continue
                 count = stars_around(at_x, at_y, i, px, py, fit.pairs.indptr,
-                                     fit.pairs.neighbour, members)
+                                     fit.pairs.neighbour, limits.free,
+                                     members)
                 if count == 0:
                     continue
                 out.gradient[v, u] = out.information[v, u] = 0.0

@@ -9,9 +9,8 @@ from photutils_mgauss.kernels.jit import inner, kernel
 from photutils_mgauss.kernels.linear import cholesky
 
 # So many stars around a pixel are free to readjust when a further one is
-# looked for there, those within this distance [pix].
+# looked for there.
 MOST_BESIDE = 4
-_FREE_DISTANCE = 3.0
 
 
 class Planes(NamedTuple):
@@ -46,11 +45,13 @@ class Limits(NamedTuple):
     """
     Where a further star is looked for.
 
-    Within reach of a star [pix], where more than the fraction least of the
-    information is left, and if it may reach the significance threshold.
+    Within reach of a star [pix], with stars within the distance free to
+    readjust [pix], where more than the fraction least of the information is
+    left, and if it may reach the significance threshold.
     """
 
     reach: float
+    free: float
     least: float
     threshold: float
 
@@ -195,9 +196,9 @@ def _template_overlap(x, y, template, weight, left, bottom, width, offset,
 
 
 @inner
-def stars_around(column, row, i, x, y, indptr, neighbour, members):
+def stars_around(column, row, i, x, y, indptr, neighbour, free, members):
     """
-    Put the stars around a pixel into members; return how many.
+    Put the stars within a distance of a pixel into members; return how many.
 
     None if another than star i is nearest to it.
     """
@@ -209,7 +210,7 @@ def stars_around(column, row, i, x, y, indptr, neighbour, members):
         other = (x[j] - column)**2 + (y[j] - row)**2
         if other < gap:
             return 0
-        if other < _FREE_DISTANCE * _FREE_DISTANCE and count < members.size:
+        if other < free * free and count < members.size:
             members[count] = j
             count += 1
     return count
@@ -316,7 +317,7 @@ def score_beside(fit, templates, planes, limits, scratch, significance, flux):
     indptr, neighbour, _ = fit.pairs
     weight, residual, light = planes
     stamps, cell = templates
-    reach, least, threshold = limits
+    reach, free, least, threshold = limits
     side = int(ceil(reach))
     for i in range(px.size):
         row, column = int(np.rint(py[i])), int(np.rint(px[i]))
@@ -325,8 +326,8 @@ def score_beside(fit, templates, planes, limits, scratch, significance, flux):
                            min(nx, column + side + 1)):
                 if (px[i] - x)**2 + (py[i] - y)**2 > reach * reach:
                     continue
-                count = stars_around(x, y, i, px, py, indptr, neighbour,
-                                      members)
+                count = stars_around(x, y, i, px, py, indptr, neighbour, free,
+                                     members)
                 if count == 0:
                     continue
                 significance[y, x] = 0.0

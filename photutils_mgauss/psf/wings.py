@@ -6,8 +6,8 @@ from scipy.ndimage import distance_transform_edt, find_objects, label
 
 from photutils_mgauss import kernels
 
-# Wings are looked at so far from what is hidden [pix].
-WINGS = 7
+# Wings are looked at so far from what is hidden [pix], of wide PSFs further.
+_WINGS = 7
 # How well the PSF of bright wings is known, as a fraction of their light.
 _PSF_ERROR = 0.05
 # Places are tried a pixel apart, at most so many, then ever closer.
@@ -25,7 +25,8 @@ class WingStar:
 
     ``x``, ``y`` and ``flux`` are where a fit can start, ``significance`` how
     well its wings are seen, ``core`` [pix] how far from its middle pixels are
-    hidden, ``clump`` which (y, x) slices hold all bad pixels.
+    hidden, ``half`` half the width of pixels that hold its wings, ``clump``
+    which (y, x) slices hold all bad pixels.
     """
 
     x: float
@@ -33,12 +34,13 @@ class WingStar:
     flux: float
     significance: float
     core: int
+    half: int
     clump: tuple
 
-    @property
-    def half(self):
-        """Half the width of pixels that hold its wings."""
-        return self.core + WINGS
+
+def reach_of_wings(psf):
+    """Return how far from what is hidden a PSF's wings are looked at [pix]."""
+    return round(psf.scale * _WINGS)
 
 
 def stars_behind(psf, data, weight, *, level=0.0, sizes=(1, np.inf)):
@@ -101,10 +103,10 @@ def place_behind(psf, data, weight, box, clump):
         The pixels around it, None if none is good.
     """
     core, y, x = core_of(clump)
+    half = core + reach_of_wings(psf)
     y, x = y + box[0].start, x + box[1].start
     window = tuple(
-        slice(max(0, int(at.min()) - core - WINGS),
-              min(n, int(at.max()) + core + WINGS + 1))
+        slice(max(0, int(at.min()) - half), min(n, int(at.max()) + half + 1))
         for at, n in zip((y, x), data.shape, strict=True))
     wings = Wings(psf, data[window], weight[window],
                    (window[0].start, window[1].start), x.mean(), y.mean())
@@ -128,7 +130,8 @@ def _star(psf, data, weight, level, box, clump):
     if not (significance > _SIGNIFICANT and flux * wings.peak
             > _BRIGHT_ENOUGH * max(level, bright)):
         return None
-    return WingStar(*best, flux, significance, core, box)
+    return WingStar(*best, flux, significance, core,
+                    core + reach_of_wings(psf), box)
 
 
 class Wings:

@@ -56,6 +56,9 @@ MIXTURES = (SHARP, SHARP, BROAD, BROAD)
 PSFS = [GriddedMixturePSF([one], [(0, 0)]) for one in MIXTURES]
 
 
+NARROW = [1.0] * 4
+
+
 def draw(mixture, x, y, flux, shape):
     image = np.zeros(shape)
     for a, b, f in zip(x, y, flux, strict=True):
@@ -104,7 +107,7 @@ def test_an_image_whose_wcs_is_off_is_told(field, wrong, step):
     length = np.hypot(*step)
     with pytest.warns(UserWarning,
                       match=f'stars of image {wrong} lie') as told:
-        tell_of_misplaced(there, there.psfs, motions=False)
+        tell_of_misplaced(there, there.psfs, NARROW, motions=False)
     found = float(re.search(r'lie (\d\.\d\d) pixels',
                             str(told[0].message))[1])
     assert abs(found - length) < 0.1
@@ -125,18 +128,18 @@ def test_stars_that_move_together_are_not_images_that_are_off(field):
         wcs.wcs.crval += [0.0, 6e-6 * k]
         images[k] = ImageEpoch(image.data, image.psf, wcs, image.time)
     there = read_field(images)
-    tell_of_misplaced(there, there.psfs, motions=True)
+    tell_of_misplaced(there, there.psfs, NARROW, motions=True)
     with pytest.warns(UserWarning, match='motions=True if the stars move'):
-        tell_of_misplaced(there, there.psfs, motions=False)
+        tell_of_misplaced(there, there.psfs, NARROW, motions=False)
 
 
 def test_right_images_and_images_of_nothing_are_not_told(field):
     there = read_field(field[0])
-    tell_of_misplaced(there, there.psfs, motions=False)
+    tell_of_misplaced(there, there.psfs, NARROW, motions=False)
     noise = np.random.default_rng(1).normal(size=(100, 100))
     there = read_field([(NDData(noise, StdDevUncertainty(np.ones((100, 100)))),
                          PSFS[0], one) for one in WCS_OF])
-    tell_of_misplaced(there, there.psfs, motions=False)
+    tell_of_misplaced(there, there.psfs, NARROW, motions=False)
 
 
 @pytest.fixture(scope='module')

@@ -1,6 +1,8 @@
 """Wide PSFs: all lengths follow the width of the PSF."""
 import numpy as np
 import pytest
+from astropy.nddata import NDData, StdDevUncertainty
+from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 
@@ -59,6 +61,41 @@ def test_no_star_of_a_dense_field_is_thrown_away(seed):
     psf, data, error, *_ = scene(6, n=40, seed=seed, squares=4)
     table = CrowdedMixturePhotometry(GriddedMixturePSF([psf], [(0, 0)]))(
         data, error=error)
+    assert table.meta['reduced_chi2'] < 1.1
+
+
+def frame(side, x, turn):
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = 'RA---TAN', 'DEC--TAN'
+    wcs.wcs.crpix, wcs.wcs.crval = (side / 2 + x, side / 2), (150, 2)
+    c, s = 2e-5 * np.cos(turn), 2e-5 * np.sin(turn)
+    wcs.wcs.cd = [[-c, s], [s, c]]
+    return wcs
+
+
+def test_wide_stars_are_found_and_measured_in_many_images():
+    width = 7
+    psf, data, _, x, y, flux = scene(width, squares=8)
+    side, grid = len(data), GriddedMixturePSF([psf], [(0, 0)])
+    frames = [frame(side, *how) for how in ((0, 0), (7, 0.1), (-5, -0.2))]
+    sky, rng = frames[0].pixel_to_world(x, y), np.random.default_rng(1)
+    images = []
+    for wcs in frames:
+        light = 50 + render_stars(grid, *wcs.world_to_pixel(sky), flux,
+                                  data.shape)
+        images.append((NDData(rng.normal(light, np.sqrt(light)),
+                              StdDevUncertainty(np.sqrt(light))), grid, wcs))
+    table = CrowdedMixturePhotometry(None).fit_images(images)
+    places = np.column_stack([x, y])
+    gap = cKDTree(places).query(places, k=2)[0][:, 1]
+    alone = ((gap > width) & (np.abs(places / side - 0.5) < 0.4).all(axis=1)
+             & (flux * np.sqrt(psf.evaluate(0, 0) / 100) > 8))
+    assert alone.sum() > 30
+    distance, row = cKDTree(np.column_stack(
+        [table['x_fit'][:, 0], table['y_fit'][:, 0]])).query(places[alone])
+    assert np.mean(distance < 0.25 * width) > 0.95
+    pull = (table['flux'][row] - flux[alone, None]) / table['flux_err'][row]
+    assert 1.48 * np.nanmedian(np.abs(pull)) < 1.2
     assert table.meta['reduced_chi2'] < 1.1
 
 
