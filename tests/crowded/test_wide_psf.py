@@ -73,11 +73,12 @@ def frame(side, x, turn):
     return wcs
 
 
+@pytest.mark.long
 def test_wide_stars_are_found_and_measured_in_many_images():
-    width = 7
-    psf, data, _, x, y, flux = scene(width, squares=8)
+    width = 12
+    psf, data, _, x, y, flux = scene(width, n=18, squares=5)
     side, grid = len(data), GriddedMixturePSF([psf], [(0, 0)])
-    frames = [frame(side, *how) for how in ((0, 0), (7, 0.1), (-5, -0.2))]
+    frames = [frame(side, *how) for how in ((0, 0), (7, 0.1))]
     sky, rng = frames[0].pixel_to_world(x, y), np.random.default_rng(1)
     images = []
     for wcs in frames:
@@ -90,7 +91,7 @@ def test_wide_stars_are_found_and_measured_in_many_images():
     gap = cKDTree(places).query(places, k=2)[0][:, 1]
     alone = ((gap > width) & (np.abs(places / side - 0.5) < 0.4).all(axis=1)
              & (flux * np.sqrt(psf.evaluate(0, 0) / 100) > 8))
-    assert alone.sum() > 30
+    assert alone.sum() > 10
     distance, row = cKDTree(np.column_stack(
         [table['x_fit'][:, 0], table['y_fit'][:, 0]])).query(places[alone])
     assert np.mean(distance < 0.25 * width) > 0.95
