@@ -92,7 +92,7 @@ def measure(run):
     for name in METHODS:
         if name not in found['errors']['method']:
             run.skipped.setdefault(
-                name, 'not installed where this was measured')
+                name, 'not run where this was measured')
     run.skipped['DOLPHOT'] = f'not run here ({INSTALL["DOLPHOT"]})'
     return found
 
