@@ -97,8 +97,7 @@ class Campaign:
             what = ' and '.join(['parallax'] * self.parallax
                                 + ['acceleration'] * self.acceleration)
             notes.append(FEW_TIMES.format(
-                what=what, wanted=self.n_times,
-                got=len(np.unique(np.round(self.years, 6)))))
+                what=what, wanted=self.n_times, got=self._n_distinct))
         return tuple(notes)
 
     @property
@@ -109,8 +108,13 @@ class Campaign:
     @property
     def has_times_enough(self):
         """Whether a star in all images would have all parameters."""
+        return self._n_distinct >= self.n_times
+
+    @property
+    def _n_distinct(self):
+        """The number of distinct times of the images."""
         every = np.ones((1, len(self.years)), bool)
-        return bool(_periods(self.years, every)[0] >= self.n_times)
+        return int(_periods(self.years, every)[0])
 
     def factors(self, places):
         """
